@@ -1,0 +1,1 @@
+"""Hydra configuration of `turbnet train`, installed as the package turbnet.configs."""

@@ -1,0 +1,5 @@
+"""`python -m turbnet`."""
+
+from turbnet.cli import main
+
+main()

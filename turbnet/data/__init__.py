@@ -1,0 +1,1 @@
+"""Clean sources, clips and the pair maker."""

@@ -1,0 +1,1 @@
+"""Light in still air."""

@@ -1,0 +1,1 @@
+"""Turbulence on images."""

@@ -1,0 +1,1 @@
+"""What is learned from what: LightningModules and their losses."""

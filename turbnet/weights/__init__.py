@@ -1,0 +1,1 @@
+"""Released networks: ONNX files with their cards."""
