@@ -30,25 +30,30 @@ _CHUNK = 8192  # PSFs at a time, so that memory does not grow with the picture
 
 
 @lru_cache
-def _pupil(modes: int) -> tuple[Tensor, Tensor]:
-    """Indices of the aperture's samples in a (2 _PUPIL)^2 grid and Z_4..Z_modes there, (modes-3, samples)."""
-    x = (np.arange(_PUPIL) - (_PUPIL - 1) / 2) / (_PUPIL / 2)
-    xx, yy = np.meshgrid(x, x)
-    inside = np.hypot(xx, yy) <= 1
-    basis = zernike_basis(range(4, modes + 1), np.hypot(xx, yy)[inside], np.arctan2(yy, xx)[inside])
-    rows, columns = np.nonzero(inside)
-    return torch.as_tensor(rows * 2 * _PUPIL + columns), torch.as_tensor(basis, dtype=torch.float32)
+def _pupil(modes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The aperture on a (2 _PUPIL)^2 grid: index of each sample, its part inside the disk, and Z_4..Z_modes there.
+
+    Counting samples at the rim by the part of their area inside makes sixteen across as good as many more.
+    """
+    fine = 16
+    x = (np.arange(_PUPIL * fine) + 0.5) / (_PUPIL * fine / 2) - 1
+    inside = np.hypot(*np.meshgrid(x, x)) <= 1
+    part = inside.reshape(_PUPIL, fine, _PUPIL, fine).mean(axis=(1, 3))
+    x = (np.arange(_PUPIL) + 0.5) / (_PUPIL / 2) - 1
+    rows, columns = np.nonzero(part)
+    y, x = x[rows], x[columns]
+    basis = zernike_basis(range(4, modes + 1), np.hypot(x, y), np.arctan2(y, x))
+    index = torch.as_tensor(rows * 2 * _PUPIL + columns)
+    return index, torch.as_tensor(part[rows, columns]), torch.as_tensor(basis)
 
 
 def tilt_free_psf(high_PN: Tensor) -> Tensor:
     """Tilt-free PSFs (P, KERNEL, KERNEL) of coefficients a_4..a_J (P, J-3), rad; each sums to one."""
-    index, basis = _pupil(high_PN.shape[-1] + 3)
-    index, basis = index.to(high_PN.device), basis.to(high_PN)
-    phase = high_PN @ basis
+    index, part, basis = _pupil(high_PN.shape[-1] + 3)
+    phase = high_PN @ basis.to(high_PN)
+    wave = torch.polar(part.to(phase).expand_as(phase), phase)
     size = 2 * _PUPIL
-    field = phase.new_zeros((len(phase), size * size), dtype=torch.complex64 if phase.dtype == torch.float32 else None)
-    field = field.to(torch.complex128) if phase.dtype == torch.float64 else field
-    field = field.index_copy(1, index, torch.polar(torch.ones_like(phase), phase))
+    field = wave.new_zeros((len(wave), size * size)).index_copy(1, index.to(wave.device), wave)
     psf = torch.fft.fft2(field.view(-1, size, size)).abs().square()
     psf = torch.fft.fftshift(psf, dim=(-2, -1))[:, 1:, 1:]  # odd, centred on the zero shift
     return psf / psf.sum(dim=(-2, -1), keepdim=True)
@@ -68,7 +73,7 @@ class PSFBasis:
 
     def weights(self, psf_Pkk: Tensor) -> Tensor:
         """Projection of PSFs on the components, (P, M)."""
-        return (psf_Pkk - self.mean).flatten(1) @ self.components.flatten(1).T
+        return (psf_Pkk - self.mean.to(psf_Pkk)).flatten(1) @ self.components.flatten(1).T.to(psf_Pkk)
 
     def psf(self, weights_PM: Tensor) -> Tensor:
         """PSFs (P, KERNEL, KERNEL) from their weights."""
@@ -91,13 +96,17 @@ def psf_basis(components: int, weakest: float, strongest: float, modes: int = 36
     log_range = np.log(max(weakest, 1e-3)), np.log(max(strongest, 1e-3))
     strength = torch.exp(log_range[0] + (log_range[1] - log_range[0]) * torch.rand(samples, 1, generator=generator))
     high = (torch.randn(samples, modes - 3, generator=generator) @ factor.T) * strength ** (5 / 6)
-    psf = tilt_free_psf(high)
+    psf = tilt_free_psf(high).double()
     mean = psf.mean(0)
-    flat = (psf - mean).flatten(1).double()
-    _, vectors = torch.linalg.eigh(flat.T @ flat)
-    keep = vectors.flip(1)[:, :components].T
+    flat = (psf - mean).flatten(1)
+    # Subspace iteration: only the leading components are wanted, of 961.
+    span = torch.randn(flat.shape[1], components + 8, generator=generator, dtype=torch.float64)
+    for _ in range(4):
+        span, _ = torch.linalg.qr(flat.T @ (flat @ span))
+    _, vectors = torch.linalg.eigh(span.T @ (flat.T @ (flat @ span)))
+    keep = (span @ vectors.flip(1)[:, :components]).T
     keep = keep * torch.where(keep[:, KERNEL * KERNEL // 2] < 0, -1.0, 1.0)[:, None]  # eigenvectors have no sign
-    return PSFBasis(mean, keep.float().view(components, KERNEL, KERNEL))
+    return PSFBasis(mean.float(), keep.float().contiguous().view(components, KERNEL, KERNEL))
 
 
 def blur_weights(high_BNhw: Tensor, basis: PSFBasis) -> Tensor:
@@ -121,9 +130,10 @@ def blur(image_BCHW: Tensor, weights_BMhw: Tensor, basis: PSFBasis, stride: int)
     """
     *_, height, width = image_BCHW.shape
     half = KERNEL // 2
-    size = [_fast(n + half) for n in (height, width)]
+    size = [_fast(n + KERNEL - 1) for n in (height, width)]
     kernels = torch.cat((basis.mean[None], basis.components)).to(image_BCHW)
-    transfer = torch.fft.rfft2(torch.roll(F.pad(kernels, (0, size[1] - KERNEL, 0, size[0] - KERNEL)), (-half, -half), (1, 2)))
+    kernels = F.pad(kernels, (0, size[1] - KERNEL, 0, size[0] - KERNEL))
+    transfer = torch.fft.rfft2(torch.roll(kernels, (-half, -half), (1, 2)))
     spectrum = torch.fft.rfft2(image_BCHW, s=size) * transfer[0]
     beta = upsample(weights_BMhw, stride, height, width)
     for m in range(beta.shape[1]):

@@ -140,6 +140,7 @@ class ZernikeField(nn.Module):
         wind: Tensor | None = None,
         frame_rate: float = 30.0,
         d_over_r0: Tensor | None = None,
+        start: int = 0,
     ) -> Draw:
         """Draw one atmosphere per seed; the same seed gives the same atmosphere, alone or in any batch.
 
@@ -150,6 +151,7 @@ class ZernikeField(nn.Module):
                 draws every frame independently.
             frame_rate: frames a second.
             d_over_r0: strength of each clip, (B,); the path's Cn2 profile is scaled to it. None: as the path says.
+            start: number of the first frame: a long clip may be drawn piece by piece.
 
         Raises:
             ParameterError: no seeds, no frames, negative strength, a strength asked of a path of still air.
@@ -162,13 +164,14 @@ class ZernikeField(nn.Module):
             return Draw(gain.new_zeros(shape), self.stride, self.margin)
         clips = []
         for index, seed in enumerate(seeds):
-            generator = torch.Generator().manual_seed(int(seed))
             if wind is None:
-                drawn = [self._frames(*self._noise(generator), None, 1, frame_rate) for _ in range(frames)]
-                clips.append(torch.cat(drawn))
+                still = self._layer_scale.new_zeros(len(self._layer_scale), 2)
+                drawn = [self._frame(self._noise(seed, frame), still) for frame in range(start, start + frames)]
             else:
-                velocity = wind[index] if wind.ndim == 3 else wind.expand(len(self._layer_scale), 2)
-                clips.append(self._frames(*self._noise(generator), velocity, frames, frame_rate))
+                velocity = (wind[index] if wind.ndim == 3 else wind.expand(len(self._layer_scale), 2)) / frame_rate
+                noise = self._noise(seed, 0)
+                drawn = [self._frame(noise, velocity * frame) for frame in range(start, start + frames)]
+            clips.append(torch.stack(drawn))
         return Draw(torch.stack(clips) * gain[:, None, None, None, None], self.stride, self.margin)
 
     def _gain(self, clips: int, d_over_r0: Tensor | None) -> Tensor:
@@ -181,7 +184,10 @@ class ZernikeField(nn.Module):
             raise ParameterError("a path of still air has no profile to scale to a D/r0; give it a Cn2 above 0")
         return (d_over_r0.to(self._grid_k) / own) ** (5 / 6)
 
-    def _noise(self, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    def _noise(self, seed: int, frame: int) -> tuple[Tensor, Tensor, Tensor]:
+        """White noise of the grid's waves, of the waves below it, and of the common tilt."""
+        mixed = np.random.SeedSequence([int(seed), frame]).generate_state(1, np.uint64)[0]
+        generator = torch.Generator().manual_seed(int(mixed))
         layers, _, waves = self._low_radial.shape
         grid = torch.randn(layers, self._size, self._size, generator=generator)
         low = torch.randn(layers, waves, dtype=torch.complex64, generator=generator)
@@ -189,28 +195,24 @@ class ZernikeField(nn.Module):
         device = self._grid_k.device
         return torch.fft.rfft2(grid.to(device), norm="ortho"), low.to(device), common.to(device)
 
-    def _frames(
-        self, grid_noise: Tensor, low_noise: Tensor, common: Tensor, wind: Tensor | None, frames: int, rate: float
-    ) -> Tensor:
-        """Coefficients (T, modes, rows, columns) of one clip carried along by the wind."""
-        out = []
-        for frame in range(frames):
-            grid, low = grid_noise, low_noise
-            if wind is not None and frame > 0:
-                # Phase in units of the scene frequency: kappa . v t = K . (v t L / z).
-                shift = (wind.to(self._layer_scale) * self._layer_scale[:, None] * (frame / rate)).to(self._grid_k)
-                grid = grid * torch.polar(torch.ones(()), -torch.einsum("lc,cyx->lyx", shift, self._grid_k))
-                low = low * torch.polar(torch.ones(()), -torch.einsum("lc,cw->lw", shift, self._low_k))
-            spectrum = torch.einsum("lyx,lnyx->nyx", grid, self._grid_radial.to(grid.dtype))[self._order]
-            field = torch.fft.irfft2(spectrum * self._grid_angle, s=(self._size, self._size), norm="forward")
-            field = field[:, : self.rows, : self.columns]
-            # A pair of waves +-K of unit-variance amplitudes adds to 2 Re.
-            waves = torch.einsum("lw,lnw->nw", low, self._low_radial.to(low.dtype))[self._order] * self._low_angle
-            field = field + 2 * torch.einsum("jw,wy,wx->jyx", waves, self._low_y, self._low_x).real
-            constant = torch.zeros(len(self.noll), 1, 1, device=field.device)
-            constant[:2, 0, 0] = self._common_tilt * common
-            out.append(field + constant)
-        return torch.stack(out)
+    def _frame(self, noise: tuple[Tensor, Tensor, Tensor], travel_L2: Tensor) -> Tensor:
+        """Coefficients (modes, rows, columns) when the air of each layer has travelled so far, m."""
+        grid, low, common = noise
+        if bool(travel_L2.any()):
+            # In units of the scene frequency: kappa . v t = K . (v t L / z).
+            shift = (travel_L2.to(self._layer_scale) * self._layer_scale[:, None]).to(self._grid_k)
+            one = shift.new_ones(())
+            grid = grid * torch.polar(one, -torch.einsum("lc,cyx->lyx", shift, self._grid_k))
+            low = low * torch.polar(one, -torch.einsum("lc,cw->lw", shift, self._low_k))
+        spectrum = torch.einsum("lyx,lnyx->nyx", grid, self._grid_radial.to(grid.dtype))[self._order]
+        field = torch.fft.irfft2(spectrum * self._grid_angle, s=(self._size, self._size), norm="forward")
+        field = field[:, : self.rows, : self.columns]
+        # A pair of waves +-K of unit-variance amplitudes adds to 2 Re.
+        waves = torch.einsum("lw,lnw->nw", low, self._low_radial.to(low.dtype))[self._order] * self._low_angle
+        field = field + 2 * torch.einsum("jw,wy,wx->jyx", waves, self._low_y, self._low_x).real
+        # Too slow to move within a clip, so the same for all its frames.
+        tilts = field[:2] + self._common_tilt * common[:, None, None]
+        return torch.cat((tilts, field[2:]))
 
 
 def _radial_filters(

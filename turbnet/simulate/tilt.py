@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_ITERATIONS = 8
+_ITERATIONS = 12
 
 
 def upsample(field_BChw: Tensor, stride: int, height: int, width: int) -> Tensor:

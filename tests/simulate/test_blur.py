@@ -1,0 +1,85 @@
+import pytest
+import torch
+from scipy.special import j1
+
+from turbnet.errors import ParameterError
+from turbnet.simulate.blur import KERNEL, blur, blur_weights, psf_basis, tilt_free_psf
+
+HALF = KERNEL // 2
+
+
+def random_high(points: int, strength: float, seed: int = 0, modes: int = 36) -> torch.Tensor:
+    import numpy as np
+
+    from turbnet.atmosphere.noll import noll_matrix
+
+    factor = torch.from_numpy(np.linalg.cholesky(noll_matrix(range(4, modes + 1)))).float()
+    noise = torch.randn(points, modes - 3, generator=torch.Generator().manual_seed(seed))
+    return noise @ factor.T * strength ** (5 / 6)
+
+
+def test_still_air_gives_the_airy_pattern():
+    psf = tilt_free_psf(torch.zeros(1, 33, dtype=torch.float64))[0]
+    x = torch.arange(1, 8, dtype=torch.float64)
+    # Pixel lambda/(2D): the argument of the Airy function is pi D / lambda times x pixels = pi x / 2.
+    v = torch.pi * x / 2
+    airy = torch.from_numpy((2 * j1(v.numpy()) / v.numpy()) ** 2)
+    measured = psf[HALF, HALF + 1 : HALF + 8] / psf[HALF, HALF]
+    assert float((measured - airy).abs().max()) < 0.005  # of the peak; sixteen samples across the aperture
+
+
+def test_psfs_sum_to_one_and_are_centred_for_even_modes():
+    psf = tilt_free_psf(random_high(20, 3.0).double())
+    torch.testing.assert_close(psf.sum((1, 2)), torch.ones(20, dtype=torch.float64))
+    defocus = torch.zeros(1, 33, dtype=torch.float64)
+    defocus[0, 0] = 1.0
+    psf = tilt_free_psf(defocus)[0]
+    torch.testing.assert_close(psf, psf.flip(0, 1), atol=1e-12, rtol=0)
+
+
+def test_basis_explains_psfs_better_with_every_component():
+    psf = tilt_free_psf(random_high(200, 3.0, seed=7))
+    errors = []
+    for components in (0, 5, 20, 60):
+        basis = psf_basis(components, 3.0, 3.0)
+        errors.append(float((basis.psf(basis.weights(psf)) - psf).square().sum() / psf.square().sum()) ** 0.5)
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] < 0.5
+    assert errors[-1] < 0.06
+
+
+def test_point_sources_spread_by_their_own_psf():
+    """The operator on a grid of points, 32 pixels apart, is the sum of each point's represented PSF."""
+    basis = psf_basis(30, 3.0, 3.0)
+    high = random_high(9, 3.0, seed=5)
+    scene = torch.zeros(1, 1, 3 * 32, 3 * 32)
+    scene[..., 16::32, 16::32] = 1
+    coarse = torch.nn.functional.interpolate(high.T.view(1, 33, 3, 3), scale_factor=32, mode="nearest")
+    out = blur(scene, blur_weights(coarse, basis), basis, stride=1)[0, 0]
+    for index, psf in enumerate(basis.psf(basis.weights(tilt_free_psf(high)))):
+        y, x = 16 + 32 * (index // 3), 16 + 32 * (index % 3)
+        window = out[y - HALF : y + HALF + 1, x - HALF : x + HALF + 1]
+        torch.testing.assert_close(window, psf, atol=1e-6, rtol=0)
+
+
+def test_energy_is_kept_away_from_the_border():
+    basis = psf_basis(8, 1.0, 4.0)
+    scene = torch.zeros(2, 3, 97, 97)
+    scene[..., 33:64, 33:64] = torch.rand(31, 31)
+    weights = blur_weights(
+        torch.nn.functional.interpolate(random_high(2 * 49, 3).T.reshape(33, 2, 7, 7).transpose(0, 1), size=25), basis
+    )
+    out = blur(scene, weights, basis, 4)
+    torch.testing.assert_close(out.sum((2, 3)), scene.sum((2, 3)), rtol=1e-4, atol=0)
+
+
+def test_gradients_in_picture_and_coefficients():
+    basis = psf_basis(3, 2.0, 2.0, modes=8)
+    high = (0.3 * random_high(4, 2.0, modes=8)).double().T.reshape(1, 5, 2, 2).requires_grad_()
+    scene = torch.rand(1, 1, 5, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, a: blur(s, blur_weights(a, basis), basis, 4), (scene, high), atol=1e-6, fast_mode=True)
+
+
+def test_too_many_components_are_refused():
+    with pytest.raises(ParameterError, match="components"):
+        psf_basis(1000, 1.0, 1.0)
