@@ -25,20 +25,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     or read-only; one that names another file (a failed read, say) passes through as it is.
 
     Raises:
-        InputError: the folder of `path` does not exist or cannot be written, `path` is something that must not be
-            replaced, or the disk is full.
+        InputError: as `check_output`, or the disk is full.
     """
-    target = Path(os.path.realpath(path))
-    parent = target.parent
-    if not parent.is_dir():
-        raise InputError(f"cannot write {path}: the folder {parent} does not exist; create it first")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise InputError(f"cannot write {path}: no permission to write in {parent}")
-    if target.is_dir() and any(target.iterdir()):
-        raise InputError(f"cannot write {path}: the folder exists and is not empty; remove it or choose another name")
-    if target.exists() and not target.is_dir() and not target.is_file():
-        raise InputError(f"cannot write {path}: it is neither a file nor a folder")
-    temporary = parent / f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}"
+    target = check_output(path)
+    temporary = target.parent / f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}"
     try:
         yield temporary
         if temporary.is_dir() and target.is_dir():
@@ -53,6 +43,25 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
         else:
             temporary.unlink(missing_ok=True)
+
+
+def check_output(path: str | Path) -> Path:
+    """The file or folder that writing to `path` would create, links followed; for a check ahead of long work.
+
+    Raises:
+        InputError: its folder does not exist or cannot be written, or it is a folder that is not empty or a device.
+    """
+    target = Path(os.path.realpath(path))
+    parent = target.parent
+    if not parent.is_dir():
+        raise InputError(f"cannot write {path}: the folder {parent} does not exist; create it first")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write {path}: no permission to write in {parent}")
+    if target.is_dir() and any(target.iterdir()):
+        raise InputError(f"cannot write {path}: the folder exists and is not empty; remove it or choose another name")
+    if target.exists() and not target.is_dir() and not target.is_file():
+        raise InputError(f"cannot write {path}: it is neither a file nor a folder")
+    return target
 
 
 def _is_about(error: OSError, temporary: Path) -> bool:

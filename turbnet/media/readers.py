@@ -5,12 +5,15 @@ memory at a time. Broken files raise InputError, at the latest when the pass com
 
 - A still, a folder, a GIF or a TIFF that cannot be decoded to its end.
 - A video whose decoder reports or conceals damage in a frame, or that ends before the frame count (MP4, MOV, AVI) or
-  the duration (MKV, WebM) its header declares. A container that declares neither is taken as it is.
+  the duration (MKV, WebM, FLV) its header declares. A container that declares neither (MPEG, TS) is taken as it is.
+
+Damage that decodes to a valid picture, as within uncompressed pixels or VP8, cannot be told from the picture.
 
 Decoders meet damaged files with whatever exception the damage leads to, hence the broad net in `_reading`.
 """
 
 import logging
+import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -89,8 +92,8 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _image_kind(path: Path) -> str | None:
-    with _reading(path), path.open("rb") as file:
-        start = file.read(16)
+    with _reading(path):
+        start = _bytes_at(path, 0, 16)
     if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return "tiff"
     known = start.startswith((b"\x89PNG", b"\xff\xd8\xff", b"BM", b"GIF8"))
@@ -131,9 +134,9 @@ def _pillow(path: Path) -> Source:
         # Players show a frame without a duration for a tenth of a second.
         fps = 1000.0 / (image.info.get("duration") or 100) if count > 1 else DEFAULT_FPS
         info = ClipInfo(count, height, width, float(fps), _is_grey(image))
-        if image.format == "GIF" and not path.read_bytes().rstrip(b"\0").endswith(b";"):
+        if image.format == "GIF" and not _bytes_at(path, -64, 64).rstrip(b"\0").endswith(b";"):
             raise InputError(f"{path} is truncated: a GIF's end marker is missing")
-        if image.format == "PNG" and count == 1 and _png_depth(path) == 16:
+        if image.format == "PNG" and count == 1 and _bytes_at(path, 24, 1) == b"\x10":  # bits a channel
             return Source(info, lambda: _deep_png(path))
 
     def frames() -> Iterator[Frame]:
@@ -158,9 +161,11 @@ def _is_grey(image: Image.Image) -> bool:
     return image.mode in _GREY_MODES or (palette is not None and palette[::3] == palette[1::3] == palette[2::3])
 
 
-def _png_depth(path: Path) -> int:
+def _bytes_at(path: Path, offset: int, count: int) -> bytes:
+    """`count` bytes from `offset`, counted from the end if negative."""
     with path.open("rb") as file:
-        return file.read(25)[24]
+        file.seek(max(offset, -path.stat().st_size), os.SEEK_END if offset < 0 else os.SEEK_SET)
+        return file.read(count)
 
 
 def _deep_png(path: Path) -> Iterator[Frame]:
@@ -290,19 +295,20 @@ def _video_stream(container: Any, path: Path) -> Any:
 
 def _decode(container: Any, path: Path) -> Iterator[Frame]:
     stream = _video_stream(container, path)
+    interval = 1 / float(stream.average_rate or DEFAULT_FPS)
     packets, count, end = 0, 0, 0.0
     for packet in container.demux(stream):
         packets += packet.size > 0
         for frame in packet.decode():
-            if frame.is_corrupt:
-                raise InputError(f"{path} is damaged at frame {count}")
+            if packet.is_corrupt or frame.is_corrupt:
+                raise InputError(f"{path} is damaged near frame {count}")
             count += 1
-            end = max(end, (frame.time or 0.0) + 1 / float(stream.average_rate or DEFAULT_FPS))
+            end = max(end, (frame.time or 0.0) + interval)
             yield _video_pixels(frame, path)
     if packets < stream.frames:
         raise InputError(f"{path} is truncated: its header says {stream.frames} frames, {packets} are there")
     duration = _declared_duration(container, stream)
-    if not stream.frames and end < duration - 0.5:
+    if not stream.frames and end < duration - max(2 * interval, 0.1):
         raise InputError(f"{path} is truncated: its header says {duration:.1f} s, its frames end at {end:.1f} s")
 
 
