@@ -172,7 +172,9 @@ def _deep_png(path: Path) -> Iterator[Frame]:
     """A PNG of 16 bits a channel, which Pillow would cut to 8."""
     with _reading(path), av.open(str(path)) as container:
         frame = next(container.decode(video=0))
-        yield _rgb(frame.to_ndarray().astype(np.uint16), path)
+        # PyAV hands out every 16-bit format but grey with alpha as it is.
+        pixels = frame.to_ndarray(format="rgba64le" if frame.format.name.startswith("ya") else None)
+        yield _rgb(pixels.astype(np.uint16), path)
 
 
 # --- TIFF --------------------------------------------------------------------------------------------------------

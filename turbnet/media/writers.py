@@ -128,7 +128,8 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, av.FFmpegError) as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+        # A short write of NumPy's carries no error number.
+        raise InputError(f"cannot write {path}: {error.strerror or f'{error}; is the disk full?'}") from error
 
 
 def _quantised(frame: Pixels) -> NDArray[np.uint8]:
