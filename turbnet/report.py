@@ -5,11 +5,14 @@ reference, tolerance and ok may be null.
 """
 
 import json
+import math
 import os
 import platform
+import shlex
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from turbnet._version import __version__
 from turbnet.media.atomic import atomic_path
@@ -56,7 +59,7 @@ class Report:
     """Rows measured by one command."""
 
     rows: list[Row] = field(default_factory=list)
-    command: str = field(default_factory=lambda: " ".join(["turbnet", *sys.argv[1:]]))
+    command: str = field(default_factory=lambda: shlex.join(["turbnet", *sys.argv[1:]]))
 
     def add(self, row: Row) -> Row:
         self.rows.append(row)
@@ -79,7 +82,9 @@ class Report:
             temporary.write_text(json.dumps(document, indent=2) + "\n")
 
 
-def _jsonable(value: object) -> object:
-    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+def _jsonable(value: Any) -> object:
+    if hasattr(value, "item"):  # a NumPy or torch scalar
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value

@@ -19,7 +19,8 @@ def run_typed(function: Callable[..., object], arguments: list[str], name: str) 
     try:
         result = command.main(args=arguments, prog_name=f"turbnet {name}", standalone_mode=False)
     except _UsageError as error:
-        print(f"turbnet {name}: {error.format_message()}; see turbnet {name} --help", file=sys.stderr)
+        message = " ".join(error.format_message().split()).rstrip(".")
+        print(f"turbnet {name}: {message}; see turbnet {name} --help", file=sys.stderr)
         return 2
     except typer.Abort:
         return 130
