@@ -1,6 +1,7 @@
 """Clean clips for training and validation, as Lightning wants them."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import lightning as L
 from torch.utils.data import DataLoader
@@ -45,7 +46,7 @@ class ClipData(L.LightningDataModule):
         self.batch_size, self.workers = batch_size, workers
         ranges = (float(scales[0]), float(scales[1]))
 
-        def source(paths: list) -> Source:  # type: ignore[type-arg]
+        def source(paths: list[Path]) -> Source:
             return Mixture([Pictures(paths, ranges), Text()], [1 - text, text])
 
         train = source(folder_paths(folders) if folders else embedded_paths("train"))

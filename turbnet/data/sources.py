@@ -56,7 +56,7 @@ def load_picture(path: Path) -> Picture:
     """
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
+            return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
     except (OSError, UnidentifiedImageError) as error:
         raise InputError(f"cannot read the picture {path}: {error}") from error
 
@@ -129,4 +129,4 @@ class Mixture:
 def _resize(picture: Picture, scale: float, height: int, width: int) -> Picture:
     size = (max(height, round(picture.shape[0] * scale)), max(width, round(picture.shape[1] * scale)))
     image = Image.fromarray((picture * 255 + 0.5).astype(np.uint8))
-    return np.asarray(image.resize(size[::-1], Image.Resampling.LANCZOS), dtype=np.float32) / 255
+    return np.asarray(image.resize(size[::-1], Image.Resampling.LANCZOS), dtype=np.float32) / np.float32(255)

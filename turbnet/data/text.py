@@ -46,7 +46,7 @@ def render_text(rng: np.random.Generator, height: int, width: int) -> NDArray[np
             draw.text((x, y), word, fill=ink, font=font)
             x += int(font.getlength(word)) + size // 2
         y += int(size * rng.uniform(1.1, 1.6))
-    return np.asarray(picture, dtype=np.float32) / 255
+    return np.asarray(picture, dtype=np.float32) / np.float32(255)
 
 
 def _colours(rng: np.random.Generator) -> tuple[tuple[int, int, int], tuple[int, int, int]]:

@@ -73,7 +73,7 @@ class TiltNet(nn.Module):
         batch, count, channels, height, width = frames_BTCHW.shape
         frames = frames_BTCHW.flatten(0, 1)
         tilt = frames.new_zeros((batch * count, 2, height // SCALES[0], width // SCALES[0]))
-        tilts = []
+        tilts: list[Tensor] = []
         for scale, level in zip(SCALES, self.levels, strict=True):
             small = F.avg_pool2d(frames, scale)
             if tilts:

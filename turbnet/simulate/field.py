@@ -80,6 +80,17 @@ class ZernikeField(nn.Module):
         ParameterError: a size, stride, mode or layer count out of range.
     """
 
+    _order: Tensor
+    _grid_radial: Tensor
+    _grid_angle: Tensor
+    _low_radial: Tensor
+    _low_angle: Tensor
+    _low_y: Tensor
+    _low_x: Tensor
+    _grid_k: Tensor
+    _low_k: Tensor
+    _layer_scale: Tensor
+
     def __init__(
         self,
         path: OpticalPath,

@@ -42,11 +42,11 @@ class Restoration(SimulatedTask):
     def trained(self) -> Iterable[nn.Parameter]:
         """The network, or its transformer alone."""
         part = self.net.tcja if self.hparams["freeze_tilt"] else self.net
-        return part.parameters()  # type: ignore[union-attr,operator]
+        return part.parameters()
 
     def _step(self, batch: Scene, stage: str) -> Tensor:
         pair = self.pair(batch)
-        restored, registered = self.net.stages(pair.frames)  # type: ignore[operator]
+        restored, registered = self.net.stages(pair.frames)
         loss = charbonnier(restored, pair.target)
         values = {"charbonnier": loss}
         if not self.hparams["freeze_tilt"]:

@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from turbnet.data.clips import Scene
 from turbnet.data.pairs import Pair, PairMaker
+from turbnet.errors import InputError
 from turbnet.nets import build
+from turbnet.nets.restorer import Restorer
 
 
 class SimulatedTask(L.LightningModule):
@@ -53,7 +55,10 @@ class SimulatedTask(L.LightningModule):
                 **more,
             }
         )
-        self.net = build(net)
+        restorer = build(net)
+        if not isinstance(restorer, Restorer):
+            raise InputError(f"this task trains a restorer; the network {net.get('name')!r} is none")
+        self.net = restorer
         self.pairs = PairMaker(**simulator)
 
     def trained(self) -> Iterable[nn.Parameter]:

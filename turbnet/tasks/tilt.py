@@ -24,11 +24,11 @@ class TiltRemoval(SimulatedTask):
 
     def trained(self) -> Iterable[nn.Parameter]:
         """Only the tilt net."""
-        return self.net.tilt.parameters()  # type: ignore[union-attr,operator]
+        return self.net.tilt.parameters()
 
     def _step(self, batch: Scene, stage: str) -> Tensor:
         pair = self.pair(batch)
-        registered = self.net.tilt(pair.frames)  # type: ignore[operator]
+        registered = self.net.tilt(pair.frames)
         distance = registration_loss(pair.frames, pair.blur_only, registered.tilts)
         error = tilt_loss(registered.tilts, pair.tilt)
         loss = distance + self.hparams["tilt_weight"] * error
