@@ -29,26 +29,23 @@ def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         raise InputError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
     except Exception as error:  # torch.load raises whatever its parsers raise
         raise InputError(f"{path} is not a checkpoint of turbnet train, or it is damaged") from error
-    try:
-        hyper_parameters = dict(checkpoint["hyper_parameters"])
-        config = dict(hyper_parameters["net"])
-        name = config["name"]
-        weights = {
-            key.removeprefix(PREFIX): weight
-            for key, weight in checkpoint["state_dict"].items()
-            if key.startswith(PREFIX)
-        }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is a checkpoint of other software: it names no network of turbnet") from error
+    match checkpoint:
+        case {
+            "hyper_parameters": {"net": {"name": str(name)} as config} as hyper_parameters,
+            "state_dict": dict(state),
+        }:
+            weights = {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
+        case _:
+            raise InputError(f"{path} is a checkpoint of other software: it names no network of turbnet")
     try:
         network = nets.build(config)
-    except InputError as error:
+    except (InputError, TypeError) as error:  # unknown network, unknown argument
         raise InputError(f"{path}: {error}") from error
     try:
         network.load_state_dict(weights, strict=True)
     except RuntimeError as error:
         raise InputError(f"{path}: its weights do not fit the network {name} that it names") from error
-    return network.eval(), hyper_parameters
+    return network.eval(), dict(hyper_parameters)
 
 
 def card_of(network: nn.Module, hyper_parameters: dict[str, Any], frames: int) -> ModelCard:
