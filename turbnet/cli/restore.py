@@ -19,7 +19,7 @@ def restore(
     model: Annotated[str, typer.Option(help="a released model by name, or an ONNX file of turbnet export")] = "small",
     crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
-    tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 256,
+    tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 384,
     threads: Annotated[int | None, typer.Option(help="processor threads; default: all cores")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar, no summary")] = False,

@@ -15,7 +15,7 @@ from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
 
-TILE = 256
+TILE, OVERLAP = 384, 32
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ def restore_clip(
     Args:
         crop: (left, top, width, height), pixels; None: the whole frame.
         tile: greatest side of a tile, pixels.
-        overlap: of neighbouring tiles, pixels; None: an eighth of the tile.
+        overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
         window: frames restored together; None: what the model's card recommends.
         quiet: no progress bar on standard error.
 
     Raises:
         InputError: the source cannot be read, the destination cannot be written, a parameter is out of range.
     """
-    tiling = Tiling(tile, tile // 8 if overlap is None else overlap, model.card.size_multiple)
+    tiling = Tiling(tile, min(OVERLAP, tile // 4) if overlap is None else overlap, model.card.size_multiple)
     window = int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
     count, inside, start = 0, 0.0, time.perf_counter()
     with (
@@ -130,12 +130,12 @@ def restore_clip(
         for frame_HWC in restore_frames(clip, network, tiling, window):
             writer.write(frame_HWC)
             count += 1
-        if not count:
-            raise InputError(f"{source} holds no frames")
     seconds = time.perf_counter() - start
     return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside)
 
 
 def _progress(quiet: bool) -> Progress:
+    """A bar with the time left, gone when the work is done; none where no terminal shows it."""
+    console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=Console(stderr=True), disable=quiet)
+    return Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal)

@@ -98,7 +98,9 @@ class Tiling:
         """
         frames, _, height, width = frames_TCHW.shape
         padding = [(0, self._padded(side) - side) for side in (height, width)]
-        padded_TCHW = np.pad(frames_TCHW, [(0, 0), (0, 0), *padding], mode="reflect")
+        padded_TCHW = frames_TCHW
+        if padding != [(0, 0), (0, 0)]:  # np.pad would copy the whole window
+            padded_TCHW = np.pad(frames_TCHW, [(0, 0), (0, 0), *padding], mode="reflect")
         rows, columns = self.axes(height, width)
 
         blended_TCHW: np.ndarray | None = None
