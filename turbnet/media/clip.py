@@ -1,0 +1,78 @@
+"""Clips in and out: `open_clip` and `open_writer` stream frames, `read_clip` and `write_clip` take a whole clip.
+
+A frame is float32 (H, W, 3), RGB in [0, 1], sRGB-encoded as stored; `turbnet.media.colour` makes it linear.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from turbnet.errors import InputError
+from turbnet.media.readers import ClipInfo, Frame, Source, open_source
+from turbnet.media.writers import ClipWriter, open_writer, write_clip
+
+__all__ = ["ClipInfo", "ClipReader", "ClipWriter", "open_clip", "open_writer", "read_clip", "write_clip"]
+
+
+class ClipReader:
+    """A clip to iterate over, one frame in memory at a time; every iteration starts from the first frame."""
+
+    def __init__(self, path: Path, source: Source, crop: tuple[int, int, int, int] | None) -> None:
+        self.path = path
+        self._source = source
+        self._pass: Iterator[Frame] | None = None
+        whole = source.info
+        left, top, width, height = crop or (0, 0, whole.width, whole.height)
+        inside = left >= 0 and top >= 0 and left + width <= whole.width and top + height <= whole.height
+        if not inside or width < 1 or height < 1:
+            raise InputError(
+                f"the crop {left},{top},{width},{height} (left, top, width, height) does not lie inside {path}, "
+                f"which is {whole.width}x{whole.height} pixels"
+            )
+        self._window = slice(top, top + height), slice(left, left + width)
+        self.info = ClipInfo(whole.frames, height, width, whole.fps, whole.grey)
+
+    def __iter__(self) -> Iterator[Frame]:
+        self._pass = self._frames()
+        return self._pass
+
+    def _frames(self) -> Iterator[Frame]:
+        whole = self._source.info
+        for index, frame in enumerate(self._source.frames()):
+            if frame.shape[:2] != (whole.height, whole.width):
+                raise InputError(
+                    f"frame {index} of {self.path} is {frame.shape[1]}x{frame.shape[0]} pixels but the first is "
+                    f"{whole.width}x{whole.height}; all frames must have one size"
+                )
+            yield np.ascontiguousarray(frame[self._window])
+
+    def __enter__(self) -> "ClipReader":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._pass = None
+
+
+def open_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> ClipReader:
+    """Open an image, a folder of images, a GIF, a multi-page TIFF or a video for reading.
+
+    Args:
+        path: file or folder. Stills and TIFFs, which carry no rate, get 25 frames per second.
+        crop: (left, top, width, height) in pixels; None: the whole picture.
+
+    Raises:
+        InputError: the path is missing, empty, damaged or not a clip, its frames differ in size, or the crop does not
+            lie inside the picture. Damage further on in the clip is raised when the iteration comes to it.
+    """
+    return ClipReader(Path(path), open_source(Path(path)), crop)
+
+
+def read_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> tuple[NDArray[np.float32], ClipInfo]:
+    """The whole clip (T, H, W, 3) and its header, `frames` being T. Raises as `open_clip`."""
+    with open_clip(path, crop) as clip:
+        frames_THWC = np.stack(list(clip))
+        info = clip.info
+    return frames_THWC, ClipInfo(len(frames_THWC), info.height, info.width, info.fps, info.grey)
