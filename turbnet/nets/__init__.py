@@ -1,1 +1,28 @@
-"""Networks as pure modules."""
+"""Networks as pure modules, and the one table that names them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import nn
+
+from turbnet.errors import InputError
+from turbnet.nets.restorer import Restorer
+
+NETS: dict[str, type[nn.Module]] = {"restorer": Restorer}
+"""Every network that a config or a checkpoint can name."""
+
+
+def build(config: Mapping[str, Any]) -> nn.Module:
+    """Build the network that `config["name"]` names from the other entries.
+
+    Raises:
+        InputError: there is no such network, or it does not take these arguments.
+    """
+    arguments = dict(config)
+    name = arguments.pop("name", None)
+    if name not in NETS:
+        raise InputError(f"there is no network named {name!r}; the networks are {', '.join(NETS)}")
+    try:
+        return NETS[name](**arguments)
+    except TypeError as error:
+        raise InputError(f"network {name!r}: {error}") from error

@@ -1,0 +1,74 @@
+"""Clean clips for training and validation, as Lightning wants them."""
+
+from collections.abc import Sequence
+
+import lightning as L
+from torch.utils.data import DataLoader
+
+from turbnet.data.clips import CleanClips, EpochSampler, Scene
+from turbnet.data.sources import Mixture, Pictures, Source, Text, embedded_paths, folder_paths
+
+
+class ClipData(L.LightningDataModule):
+    """Clips of crops from pictures and rendered text.
+
+    Args:
+        frames, size: of a clip; crops are size x size pixels.
+        batch_size: clips of a step.
+        steps_per_epoch: training steps of an epoch; every epoch brings fresh clips.
+        folders: of the user's pictures, searched recursively; empty: the pictures embedded in scikit-image.
+        val_folders: the same for validation.
+        text: fraction of clips with rendered text.
+        moving: fraction of clips with something that moves.
+        scales: range of the factor by which pictures are reduced before cropping.
+        val_clips: clips to validate on, always the same.
+        workers: processes that make clips; the clips do not depend on their number.
+        seed: of the clips.
+    """
+
+    def __init__(
+        self,
+        frames: int = 8,
+        size: int = 128,
+        batch_size: int = 4,
+        steps_per_epoch: int = 100,
+        folders: Sequence[str] = (),
+        val_folders: Sequence[str] = (),
+        text: float = 0.25,
+        moving: float = 0.25,
+        scales: Sequence[float] = (0.5, 1.0),
+        val_clips: int = 8,
+        workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.batch_size, self.workers = batch_size, workers
+        ranges = (float(scales[0]), float(scales[1]))
+
+        def source(paths: list) -> Source:  # type: ignore[type-arg]
+            return Mixture([Pictures(paths, ranges), Text()], [1 - text, text])
+
+        train = source(folder_paths(folders) if folders else embedded_paths("train"))
+        val = source(folder_paths(val_folders) if val_folders else embedded_paths("test"))
+        self.train = CleanClips(train, steps_per_epoch * batch_size, frames, size, size, moving, seed)
+        # Another seed than training's, and the same whatever training's is.
+        self.val = CleanClips(val, val_clips, frames, size, size, moving, 2**31 - 1)
+
+    def _loader(self, clips: CleanClips, sampler: EpochSampler | None) -> DataLoader[Scene]:
+        return DataLoader(
+            clips,
+            batch_size=self.batch_size,
+            sampler=sampler,
+            num_workers=self.workers,
+            persistent_workers=self.workers > 0,
+        )
+
+    def train_dataloader(self) -> DataLoader[Scene]:
+        """Fresh clips every epoch."""
+        rank = self.trainer.global_rank if self.trainer else 0
+        world = self.trainer.world_size if self.trainer else 1
+        return self._loader(self.train, EpochSampler(len(self.train), rank, world))
+
+    def val_dataloader(self) -> DataLoader[Scene]:
+        """The same clips every time."""
+        return self._loader(self.val, None)

@@ -1,0 +1,138 @@
+r"""Blur: every scene point u spreads by its own tilt-free point-spread function b_u.
+
+.. math::
+    B(J)(x) = \sum_u J(u)\, b_u(x - u) \approx \sum_m (\phi_m * (\beta_m J))(x), \qquad
+    b_u \approx \phi_0 + \sum_{m \ge 1} \beta_m(u)\, \phi_m
+
+with phi_0 the mean PSF (beta_0 = 1) and phi_m the principal components of tilt-free PSFs. The weights beta are the
+projection of the exact PSF |F{P e^{j phi}}|^2 of each point of the coarse grid, interpolated to pixels: scattering,
+indexed by the source.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbnet.atmosphere.noll import noll_matrix
+from turbnet.errors import check_range
+from turbnet.optics.zernike import zernike_basis
+from turbnet.simulate.tilt import upsample
+
+_PUPIL = 16  # samples across the aperture; twice as many in its Fourier plane make the pixel lambda / (2 D)
+KERNEL = 2 * _PUPIL - 1
+"""Width of a PSF kernel, pixels."""
+
+_CHUNK = 8192  # PSFs at a time, so that memory does not grow with the picture
+
+
+@lru_cache
+def _pupil(modes: int) -> tuple[Tensor, Tensor]:
+    """Indices of the aperture's samples in a (2 _PUPIL)^2 grid and Z_4..Z_modes there, (modes-3, samples)."""
+    x = (np.arange(_PUPIL) - (_PUPIL - 1) / 2) / (_PUPIL / 2)
+    xx, yy = np.meshgrid(x, x)
+    inside = np.hypot(xx, yy) <= 1
+    basis = zernike_basis(range(4, modes + 1), np.hypot(xx, yy)[inside], np.arctan2(yy, xx)[inside])
+    rows, columns = np.nonzero(inside)
+    return torch.as_tensor(rows * 2 * _PUPIL + columns), torch.as_tensor(basis, dtype=torch.float32)
+
+
+def tilt_free_psf(high_PN: Tensor) -> Tensor:
+    """Tilt-free PSFs (P, KERNEL, KERNEL) of coefficients a_4..a_J (P, J-3), rad; each sums to one."""
+    index, basis = _pupil(high_PN.shape[-1] + 3)
+    index, basis = index.to(high_PN.device), basis.to(high_PN)
+    phase = high_PN @ basis
+    size = 2 * _PUPIL
+    field = phase.new_zeros((len(phase), size * size), dtype=torch.complex64 if phase.dtype == torch.float32 else None)
+    field = field.to(torch.complex128) if phase.dtype == torch.float64 else field
+    field = field.index_copy(1, index, torch.polar(torch.ones_like(phase), phase))
+    psf = torch.fft.fft2(field.view(-1, size, size)).abs().square()
+    psf = torch.fft.fftshift(psf, dim=(-2, -1))[:, 1:, 1:]  # odd, centred on the zero shift
+    return psf / psf.sum(dim=(-2, -1), keepdim=True)
+
+
+@dataclass(frozen=True)
+class PSFBasis:
+    """Mean and principal components of tilt-free PSFs.
+
+    Attributes:
+        mean: (KERNEL, KERNEL), sums to one.
+        components: (M, KERNEL, KERNEL), orthonormal; each sums to zero, as differences of PSFs do.
+    """
+
+    mean: Tensor
+    components: Tensor
+
+    def weights(self, psf_Pkk: Tensor) -> Tensor:
+        """Projection of PSFs on the components, (P, M)."""
+        return (psf_Pkk - self.mean).flatten(1) @ self.components.flatten(1).T
+
+    def psf(self, weights_PM: Tensor) -> Tensor:
+        """PSFs (P, KERNEL, KERNEL) from their weights."""
+        return self.mean + torch.einsum("pm,mij->pij", weights_PM, self.components)
+
+
+@lru_cache
+def psf_basis(components: int, weakest: float, strongest: float, modes: int = 36, samples: int = 4000) -> PSFBasis:
+    """Principal components of PSFs in Kolmogorov turbulence with D/r0 log-uniform between two strengths.
+
+    Args:
+        components: M, how many to keep beyond the mean.
+        weakest, strongest: range of D/r0.
+        modes: highest Noll index.
+        samples: PSFs to learn from; seeded, so the basis is always the same.
+    """
+    check_range("PSF components", components, 0, 500)
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.as_tensor(np.linalg.cholesky(noll_matrix(range(4, modes + 1))), dtype=torch.float32)
+    log_range = np.log(max(weakest, 1e-3)), np.log(max(strongest, 1e-3))
+    strength = torch.exp(log_range[0] + (log_range[1] - log_range[0]) * torch.rand(samples, 1, generator=generator))
+    high = (torch.randn(samples, modes - 3, generator=generator) @ factor.T) * strength ** (5 / 6)
+    psf = tilt_free_psf(high)
+    mean = psf.mean(0)
+    flat = (psf - mean).flatten(1).double()
+    _, vectors = torch.linalg.eigh(flat.T @ flat)
+    keep = vectors.flip(1)[:, :components].T
+    keep = keep * torch.where(keep[:, KERNEL * KERNEL // 2] < 0, -1.0, 1.0)[:, None]  # eigenvectors have no sign
+    return PSFBasis(mean, keep.float().view(components, KERNEL, KERNEL))
+
+
+def blur_weights(high_BNhw: Tensor, basis: PSFBasis) -> Tensor:
+    """beta on the coarse grid, (B, M, h, w), from coefficients a_4..a_J by exact pupil transforms."""
+    batch, modes, h, w = high_BNhw.shape
+    points = high_BNhw.permute(0, 2, 3, 1).reshape(-1, modes)
+    weights = torch.cat([basis.weights(tilt_free_psf(chunk)) for chunk in points.split(_CHUNK)])
+    return weights.view(batch, h, w, -1).permute(0, 3, 1, 2)
+
+
+def blur(image_BCHW: Tensor, weights_BMhw: Tensor, basis: PSFBasis, stride: int) -> Tensor:
+    """Scatter the image by the PSFs that `weights` describe on the coarse grid.
+
+    The picture is taken as black beyond its edges: give it a margin of KERNEL // 2 pixels and cut that off.
+
+    Args:
+        image_BCHW: linear intensities; differentiable.
+        weights_BMhw: beta on the coarse grid, from `blur_weights`; differentiable.
+        basis: the PSF basis they belong to.
+        stride: step of the coarse grid, pixels.
+    """
+    *_, height, width = image_BCHW.shape
+    half = KERNEL // 2
+    size = [_fast(n + half) for n in (height, width)]
+    kernels = torch.cat((basis.mean[None], basis.components)).to(image_BCHW)
+    transfer = torch.fft.rfft2(torch.roll(F.pad(kernels, (0, size[1] - KERNEL, 0, size[0] - KERNEL)), (-half, -half), (1, 2)))
+    spectrum = torch.fft.rfft2(image_BCHW, s=size) * transfer[0]
+    beta = upsample(weights_BMhw, stride, height, width)
+    for m in range(beta.shape[1]):
+        spectrum = spectrum + torch.fft.rfft2(image_BCHW * beta[:, m : m + 1], s=size) * transfer[m + 1]
+    return torch.fft.irfft2(spectrum, s=size)[..., :height, :width]
+
+
+def _fast(size: int) -> int:
+    """Smallest number >= size that FFTs like."""
+    from scipy.fft import next_fast_len
+
+    return int(next_fast_len(size, real=True))

@@ -1,0 +1,131 @@
+"""The simulator: draw an atmosphere, tilt, blur, sense. Everything in linear intensities.
+
+`I = sensor(B(T(J)))`: tilt first, blur second, both indexed by the source point (see `turbnet.simulate.tilt` and `.blur`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from turbnet.atmosphere.path import OpticalPath
+from turbnet.errors import InputError
+from turbnet.simulate.blur import KERNEL, PSFBasis, blur, blur_weights, psf_basis
+from turbnet.simulate.field import TILT_PIXELS, Draw, ZernikeField
+from turbnet.simulate.sensor import Sensor
+from turbnet.simulate.tilt import tilt, upsample
+
+
+@dataclass(frozen=True)
+class Turbulent:
+    """A simulated clip and the truth about it; all linear intensities, (B, T, C, H, W) unless said otherwise.
+
+    Attributes:
+        frames: what the camera sees.
+        blur_only: the scene through the same blur without tilt: what a perfect tilt removal would return.
+        tilt_only: the scene moved but not blurred.
+        tilt: where each scene point moved, (B, T, 2, H, W), pixels, x then y. Sampling `frames` at x + tilt(x) undoes it.
+        draw: the atmosphere, to be applied again.
+    """
+
+    frames: Tensor
+    blur_only: Tensor
+    tilt_only: Tensor
+    tilt: Tensor
+    draw: Draw
+
+
+class Simulator(nn.Module):
+    """Turbulence of one path on pictures of one size.
+
+    Args:
+        path: the turbulent path; a pixel of the picture is its Nyquist pixel in the scene.
+        height, width: size of the picture, pixels.
+        modes: highest Noll index.
+        stride: step of the coarse grid on which the atmosphere is drawn, pixels.
+        components: PSF components beyond the mean.
+        strengths: range of D/r0 for which the PSF basis is made; None: the path's own D/r0.
+        sensor: the camera's noise.
+    """
+
+    def __init__(
+        self,
+        path: OpticalPath,
+        height: int,
+        width: int,
+        modes: int = 36,
+        stride: int = 4,
+        components: int = 20,
+        strengths: tuple[float, float] | None = None,
+        sensor: Sensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.height, self.width, self.sensor = height, width, sensor or Sensor()
+        weakest, strongest = strengths or (path.d_over_r0, path.d_over_r0)
+        # Light from beyond the edge reaches the picture by blur and by tilt: four standard deviations of it.
+        reach = 4 * TILT_PIXELS * (0.4489 * strongest ** (5 / 3)) ** 0.5
+        margin = KERNEL // 2 + int(reach)
+        self.margin = -(-margin // stride) * stride
+        self.field = ZernikeField(path, height, width, self.margin, modes, stride)
+        self.basis: PSFBasis = psf_basis(components, weakest, strongest, modes)
+
+    def draw(
+        self,
+        seeds: Sequence[int],
+        frames: int = 1,
+        wind: Tensor | None = None,
+        frame_rate: float = 30.0,
+        d_over_r0: Tensor | None = None,
+    ) -> Draw:
+        """An atmosphere per seed; see `ZernikeField.draw`."""
+        return self.field.draw(seeds, frames, wind, frame_rate, d_over_r0)
+
+    def forward(self, scene_BTCHW: Tensor, draw: Draw, noise_seed: int = 0) -> Turbulent:
+        """Look at a scene through an atmosphere.
+
+        Args:
+            scene_BTCHW: linear intensities; T is the draw's number of frames, or 1 for a still scene. Differentiable.
+            draw: the atmosphere, differentiable in its coefficients.
+            noise_seed: of the sensor.
+
+        Raises:
+            InputError: the scene is of another size than the simulator, or holds values that are not finite.
+        """
+        batch, frames = draw.coefficients.shape[:2]
+        if scene_BTCHW.ndim != 5 or scene_BTCHW.shape[-2:] != (self.height, self.width):
+            raise InputError(
+                f"the scene is {tuple(scene_BTCHW.shape)}; the simulator expects (B, T, C, {self.height}, {self.width})"
+            )
+        if not bool(torch.isfinite(scene_BTCHW).all()):
+            raise InputError("the scene holds NaN or infinite values")
+        scene = scene_BTCHW.expand(batch, frames, *scene_BTCHW.shape[2:]).flatten(0, 1)
+        padded = _reflect(scene, self.margin)
+        tilts, high = draw.tilt.flatten(0, 1), draw.high.flatten(0, 1)
+
+        moved = tilt(padded, tilts, draw.stride)
+        if bool(draw.coefficients.detach().any()):
+            weights = blur_weights(high, self.basis)
+            seen = blur(moved, weights, self.basis, draw.stride)
+            unmoved = blur(padded, weights, self.basis, draw.stride)
+        else:  # still air: the scene as it is; the aperture's own diffraction is part of every scene
+            seen, unmoved = moved, padded
+        tilt_map = upsample(tilts, draw.stride, padded.shape[-2], padded.shape[-1])
+
+        def crop(x: Tensor) -> Tensor:
+            m = self.margin
+            return x[..., m : m + self.height, m : m + self.width].unflatten(0, (batch, frames))
+
+        return Turbulent(self.sensor(crop(seen), noise_seed), crop(unmoved), crop(moved), crop(tilt_map), draw)
+
+
+def _reflect(image_BCHW: Tensor, margin: int) -> Tensor:
+    """Reflect the picture `margin` pixels beyond its edges, as often as a small picture needs."""
+    while margin > 0:
+        *_, height, width = image_BCHW.shape
+        step = min(margin, max(min(height, width) - 1, 1))
+        mode = "reflect" if min(height, width) > 1 else "replicate"
+        image_BCHW = F.pad(image_BCHW, (step, step, step, step), mode=mode)
+        margin -= step
+    return image_BCHW

@@ -1,0 +1,44 @@
+"""Networks out of checkpoints, without executing code."""
+
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbnet.errors import InputError
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint of a task, loaded with `weights_only=True`.
+
+    Raises:
+        InputError: there is no such file, it is no checkpoint, or it is none of ours.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there is no checkpoint {path}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, ValueError, OSError) as error:
+        raise InputError(f"{path} is not a checkpoint that can be loaded safely: {str(error).splitlines()[0]}") from error
+    hyper = checkpoint.get("hyper_parameters") if isinstance(checkpoint, dict) else None
+    if not isinstance(hyper, dict) or not isinstance(hyper.get("net"), dict) or "state_dict" not in checkpoint:
+        raise InputError(f"{path} is not a checkpoint of turbnet: it does not say which network it holds")
+    return checkpoint
+
+
+def load_net(path: str | Path, expect: Mapping[str, Any] | None = None) -> dict[str, Tensor]:
+    """State of the network in a checkpoint.
+
+    Raises:
+        InputError: the checkpoint cannot be used, or holds another network than `expect` describes.
+    """
+    checkpoint = read_checkpoint(path)
+    found = checkpoint["hyper_parameters"]["net"]
+    if expect is not None and dict(expect) != found:
+        raise InputError(f"{path} holds another network: {found}, not {dict(expect)}")
+    prefix = "net."
+    return {key[len(prefix) :]: value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)}

@@ -1,0 +1,94 @@
+"""What every task shares that learns from simulated pairs: the simulator in the loop, the optimiser, the schedule."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor, nn
+
+from turbnet.data.clips import Scene
+from turbnet.data.pairs import Pair, PairMaker
+from turbnet.nets import build
+
+
+class SimulatedTask(L.LightningModule):
+    """A network trained on pairs that the simulator makes at every step.
+
+    Hyper-parameters are plain dicts and numbers, so that a checkpoint loads without executing code and rebuilds its own
+    parts.
+
+    Args:
+        net: config of the network, see `turbnet.nets.build`.
+        simulator: arguments of `turbnet.data.pairs.PairMaker`.
+        learning_rate: peak of the schedule: linear warm-up over `warmup` of the steps, then cosine to zero.
+        weight_decay: of AdamW.
+        warmup: fraction of the steps.
+        seed: training seed, for the record.
+        recipe: anything else worth recording in the model card.
+    """
+
+    def __init__(
+        self,
+        net: Mapping[str, Any],
+        simulator: Mapping[str, Any],
+        learning_rate: float = 1e-3,
+        weight_decay: float = 1e-4,
+        warmup: float = 0.05,
+        seed: int = 0,
+        recipe: Mapping[str, Any] | None = None,
+        **more: Any,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters(
+            {
+                "net": dict(net),
+                "simulator": dict(simulator),
+                "learning_rate": learning_rate,
+                "weight_decay": weight_decay,
+                "warmup": warmup,
+                "seed": seed,
+                "recipe": dict(recipe or {}),
+                **more,
+            }
+        )
+        self.net = build(net)
+        self.pairs = PairMaker(**simulator)
+
+    def trained(self) -> Iterable[nn.Parameter]:
+        """The parameters that this task learns."""
+        return self.net.parameters()
+
+    def pair(self, batch: Scene) -> Pair:
+        """Turbulent clips for a batch of clean ones, always in float32."""
+        with torch.autocast(self.device.type, enabled=False):
+            return self.pairs(batch["scene"].float(), batch["seed"].tolist())
+
+    def report(self, stage: str, values: Mapping[str, Tensor], clips: int) -> None:
+        """Log values under `stage/`."""
+        self.log_dict(
+            {f"{stage}/{name}": value.detach() for name, value in values.items()},
+            prog_bar=True,
+            on_step=stage == "train",
+            on_epoch=stage != "train",
+            batch_size=clips,
+            sync_dist=stage != "train",
+        )
+
+    def configure_optimizers(self) -> Any:
+        """AdamW, linear warm-up, cosine decay to zero at the last step."""
+        hyper = self.hparams
+        optimiser = torch.optim.AdamW(
+            list(self.trained()), lr=hyper["learning_rate"], weight_decay=hyper["weight_decay"], betas=(0.9, 0.99)
+        )
+        total = int(self.trainer.estimated_stepping_batches)
+        rising = max(1, round(hyper["warmup"] * total))
+
+        def factor(step: int) -> float:
+            if step < rising:
+                return (step + 1) / rising
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rising) / max(1, total - rising))))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, factor)
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -1,0 +1,46 @@
+"""Stage one: tilt removal alone."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from torch import Tensor, nn
+
+from turbnet.data.clips import Scene
+from turbnet.tasks.losses import psnr, registration_loss, tilt_loss
+from turbnet.tasks.simulated import SimulatedTask
+
+
+class TiltRemoval(SimulatedTask):
+    """Trains the tilt net of a restorer: registered frames are compared with the blur-only frames at three scales, the
+    estimated tilts with the true tilt map.
+
+    Args:
+        tilt_weight: weight of the tilt loss (pixels) against the registration loss (intensity).
+        more: see `SimulatedTask`.
+    """
+
+    def __init__(self, tilt_weight: float = 0.02, **more: Any) -> None:
+        super().__init__(tilt_weight=tilt_weight, **more)
+
+    def trained(self) -> Iterable[nn.Parameter]:
+        """Only the tilt net."""
+        return self.net.tilt.parameters()  # type: ignore[union-attr,operator]
+
+    def _step(self, batch: Scene, stage: str) -> Tensor:
+        pair = self.pair(batch)
+        registered = self.net.tilt(pair.frames)  # type: ignore[operator]
+        distance = registration_loss(pair.frames, pair.blur_only, registered.tilts)
+        error = tilt_loss(registered.tilts, pair.tilt)
+        loss = distance + self.hparams["tilt_weight"] * error
+        values = {"loss": loss, "tilt_px": error}
+        if stage == "val":
+            values["psnr"] = psnr(registered.frames, pair.blur_only)
+            values["psnr_input"] = psnr(pair.frames, pair.blur_only)
+        self.report(stage, values, len(pair.frames))
+        return loss
+
+    def training_step(self, batch: Scene, index: int) -> Tensor:
+        return self._step(batch, "train")
+
+    def validation_step(self, batch: Scene, index: int) -> None:
+        self._step(batch, "val")
