@@ -16,7 +16,10 @@ def main(arguments: list[str]) -> int:
 def export(
     checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="written by turbnet train")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="default: beside the checkpoint, .onnx")] = None,
-    frames: Annotated[int, typer.Option(help="frames to restore together, as recommended to users")] = 12,
+    frames: Annotated[
+        int | None,
+        typer.Option(help="frames to restore together, as recommended to users; default: as in training, or 12"),
+    ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no summary")] = False,
 ) -> int:
@@ -31,6 +34,8 @@ def export(
     if path.suffix != ".onnx":
         raise InputError(f"cannot write {path}: the name of a model ends in .onnx")
     network, hyper_parameters = load_network(checkpoint)
+    if frames is None:
+        frames = (hyper_parameters.get("recipe") or {}).get("frames", 12)
     card = card_of(network, hyper_parameters, int(check_range("frames", frames, 1, 1000)))
     report = Report()
     for row in export_onnx(network, card, path):

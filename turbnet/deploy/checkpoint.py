@@ -1,51 +1,32 @@
-"""Networks out of the checkpoints that `turbnet train` writes: plain values and tensors, nothing pickled."""
+"""From a checkpoint of `turbnet train` to a network and its card."""
 
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import nn
 
-from turbnet import nets
 from turbnet.deploy.card import ModelCard
 from turbnet.errors import InputError
-
-PREFIX = "net."
+from turbnet.nets import build
+from turbnet.tasks.checkpoint import load_net, read_checkpoint
 
 
 def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
-    """The network in a checkpoint, and the checkpoint's hyper-parameters.
-
-    `hyper_parameters["net"]` says what to build, the entries of `state_dict` under `net.` are its weights.
+    """The network in a checkpoint, ready to run, and the checkpoint's hyper-parameters.
 
     Raises:
         InputError: no file, no checkpoint, one of other software, or weights that do not fit the network it names.
     """
-    path = Path(path)
+    hyper_parameters = read_checkpoint(path)["hyper_parameters"]
     try:
-        with path.open("rb") as file:
-            checkpoint = torch.load(file, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise InputError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
-    except Exception as error:  # torch.load raises whatever its parsers raise
-        raise InputError(f"{path} is not a checkpoint of turbnet train, or it is damaged") from error
-    match checkpoint:
-        case {
-            "hyper_parameters": {"net": {"name": str(name)} as config} as hyper_parameters,
-            "state_dict": dict(state),
-        }:
-            weights = {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
-        case _:
-            raise InputError(f"{path} is a checkpoint of other software: it names no network of turbnet")
-    try:
-        network = nets.build(config)
-    except (InputError, TypeError) as error:  # unknown network, unknown argument
+        network = build(hyper_parameters["net"])
+    except InputError as error:
         raise InputError(f"{path}: {error}") from error
     try:
-        network.load_state_dict(weights, strict=True)
+        network.load_state_dict(load_net(path), strict=True)
     except RuntimeError as error:
-        raise InputError(f"{path}: its weights do not fit the network {name} that it names") from error
-    return network.eval(), dict(hyper_parameters)
+        raise InputError(f"{path}: its weights do not fit the network it names ({error})") from error
+    return network.eval(), hyper_parameters
 
 
 def card_of(network: nn.Module, hyper_parameters: dict[str, Any], frames: int) -> ModelCard:

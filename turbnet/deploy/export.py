@@ -49,24 +49,23 @@ def export_onnx(module: nn.Module, card: ModelCard, path: str | Path) -> list[Pa
         InputError: the network cannot be exported, or onnxruntime differs from torch by more than 1e-4; nothing is
             written then.
     """
-    module = flush_denormals(copy.deepcopy(module).cpu().float().eval())
-    model = _strip(_to_onnx(module, card))
-    model.metadata_props.extend(
-        onnx.StringStringEntryProto(key=key, value=value) for key, value in card.to_metadata().items()
-    )
-    _check_no_local_path(model)
-    data = seal(model.SerializeToString())
-    try:
-        parity = compare(module, Model(data))
-    except InputError as error:
-        raise InputError(f"cannot export {card.architecture}: {error}") from error
-    for row in parity:
-        if not row.difference <= TOLERANCE:  # NaN fails too
-            raise InputError(
-                f"cannot export {card.architecture}: onnxruntime and torch differ by {row.difference:.2g} "
-                f"on frames of shape {row.shape}; at most {TOLERANCE:g} is accepted"
-            )
     with atomic_path(path) as temporary:
+        module = flush_denormals(copy.deepcopy(module).cpu().float().eval())
+        model = _strip(_to_onnx(module, card))
+        for key, value in card.to_metadata().items():
+            model.metadata_props.add(key=key, value=value)
+        _check_no_local_path(model)
+        data = seal(model.SerializeToString())
+        try:
+            parity = compare(module, Model(data))
+        except InputError as error:
+            raise InputError(f"cannot export {card.architecture}: {error}") from error
+        for row in parity:
+            if not row.difference <= TOLERANCE:  # NaN fails too
+                raise InputError(
+                    f"cannot export {card.architecture}: onnxruntime and torch differ by {row.difference:.2g} "
+                    f"on frames of shape {row.shape}; at most {TOLERANCE:g} is accepted"
+                )
         temporary.write_bytes(data)
     return parity
 
