@@ -24,7 +24,7 @@ def checkpoint() -> dict:
     recipe = {"frames": 6, "steps": 100, "data": "/home/someone/photos"}
     return {
         "state_dict": weights | {"pairs.scale": torch.ones(1)},
-        "hyper_parameters": {"net": NET, "seed": 7, "recipe": recipe},
+        "hyper_parameters": {"net": NET, "simulator": {"d_over_r0": [1.0, 4.0]}, "seed": 7, "recipe": recipe},
     }
 
 
@@ -41,7 +41,7 @@ def test_checkpoint_to_model(checkpoint, tmp_path, capsys):
     card = model.card
     assert {"name": card.architecture, **card.config} == NET
     assert (card.size_multiple, card.frames, card.seed) == (8, 6, 7)
-    assert card.notes == {"frames": 6, "steps": 100, "data": "photos"}
+    assert card.notes == {"simulator": {"d_over_r0": [1.0, 4.0]}, "frames": 6, "steps": 100, "data": "photos"}
     assert json.loads((tmp_path / "last.json").read_text())["sha256"] == card.sha256
     assert card.sha256 in (tmp_path / "last.md").read_text()
 

@@ -50,8 +50,8 @@ def restore(
         report.add(Row("share of the network", done.network_seconds / done.seconds))
         report.write(json)
     if not quiet:
-        size = f"{done.width}x{done.height}"
-        print(f"{output}: {done.frames} frames of {size}, {done.milliseconds_a_frame:.0f} ms a frame")
+        frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
+        print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame")
 
 
 def _crop(text: str) -> tuple[int, int, int, int]:

@@ -30,19 +30,20 @@ def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
 
 
 def card_of(network: nn.Module, hyper_parameters: dict[str, Any], frames: int) -> ModelCard:
-    """The card of a network from a checkpoint; its recipe becomes the notes.
+    """The card of a network from a checkpoint; the turbulence it was trained on and the recipe become the notes.
 
     Args:
         frames: recommended length of the temporal window, frames.
     """
     config = dict(hyper_parameters["net"])
+    notes = {"simulator": hyper_parameters.get("simulator"), **(hyper_parameters.get("recipe") or {})}
     return ModelCard(
         architecture=config.pop("name"),
         config=_without_folders(config),
         size_multiple=int(network.size_multiple),  # type: ignore[arg-type]
         frames=frames,
         seed=hyper_parameters.get("seed"),
-        notes=_without_folders(hyper_parameters.get("recipe") or {}),
+        notes=_without_folders(notes),
     )
 
 
