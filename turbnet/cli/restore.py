@@ -1,0 +1,64 @@
+"""`turbnet restore`: a turbulent clip to a clear one."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from turbnet.cli.typed import run_typed
+
+
+def main(arguments: list[str]) -> int:
+    """Run the verb."""
+    return run_typed(restore, arguments, "restore")
+
+
+def restore(
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video or TIFF")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what")],
+    model: Annotated[str, typer.Option(help="a released model by name, or an ONNX file of turbnet export")] = "small",
+    crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
+    window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
+    tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 384,
+    threads: Annotated[int | None, typer.Option(help="processor threads; default: all cores")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar, no summary")] = False,
+) -> None:
+    """Restore a clip or an image seen through turbulence."""
+    from turbnet.deploy.restore import restore_clip
+    from turbnet.deploy.session import Model
+    from turbnet.deploy.weights import find_model
+    from turbnet.report import Report, Row
+
+    done = restore_clip(
+        source,
+        output,
+        Model.load(find_model(model), threads),
+        crop=_crop(crop) if crop else None,
+        tile=tile,
+        window=window,
+        quiet=quiet,
+    )
+    if json:
+        report = Report()
+        report.add(Row("frames", done.frames))
+        report.add(Row("height", done.height, "pixel"))
+        report.add(Row("width", done.width, "pixel"))
+        report.add(Row("window", done.window, "frame"))
+        report.add(Row("tiles of a frame", done.tiles))
+        report.add(Row("time a frame", done.milliseconds_a_frame, "ms"))
+        report.add(Row("share of the network", done.network_seconds / done.seconds))
+        report.write(json)
+    if not quiet:
+        frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
+        print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame")
+
+
+def _crop(text: str) -> tuple[int, int, int, int]:
+    from turbnet.errors import InputError
+
+    try:
+        left, top, width, height = (int(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--crop {text}: give left,top,width,height in pixels, such as 100,40,256,256") from error
+    return left, top, width, height

@@ -1,0 +1,58 @@
+"""From a checkpoint of `turbnet train` to a network and its card."""
+
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from turbnet.deploy.card import ModelCard
+from turbnet.errors import InputError
+from turbnet.nets import build
+from turbnet.tasks.checkpoint import load_net, read_checkpoint
+
+
+def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
+    """The network in a checkpoint, ready to run, and the checkpoint's hyper-parameters.
+
+    Raises:
+        InputError: no file, no checkpoint, one of other software, or weights that do not fit the network it names.
+    """
+    hyper_parameters = read_checkpoint(path)["hyper_parameters"]
+    try:
+        network = build(hyper_parameters["net"])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    try:
+        network.load_state_dict(load_net(path), strict=True)
+    except RuntimeError as error:
+        raise InputError(f"{path}: its weights do not fit the network it names ({error})") from error
+    return network.eval(), hyper_parameters
+
+
+def card_of(network: nn.Module, hyper_parameters: dict[str, Any], frames: int) -> ModelCard:
+    """The card of a network from a checkpoint; the turbulence it was trained on and the recipe become the notes.
+
+    Args:
+        frames: recommended length of the temporal window, frames.
+    """
+    config = dict(hyper_parameters["net"])
+    notes = {"simulator": hyper_parameters.get("simulator"), **(hyper_parameters.get("recipe") or {})}
+    return ModelCard(
+        architecture=config.pop("name"),
+        config=_without_folders(config),
+        size_multiple=int(network.size_multiple),  # type: ignore[arg-type]
+        frames=frames,
+        seed=hyper_parameters.get("seed"),
+        notes=_without_folders(notes),
+    )
+
+
+def _without_folders(value: Any) -> Any:
+    """Absolute paths cut to their last part: a card tells nothing of the machine it was made on."""
+    if isinstance(value, dict):
+        return {key: _without_folders(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_folders(item) for item in value]
+    if isinstance(value, str) and Path(value).is_absolute():
+        return Path(value).name
+    return value

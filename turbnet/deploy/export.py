@@ -1,0 +1,162 @@
+"""A torch network to a sealed ONNX file, with the proof that both compute the same.
+
+Batch, frames, height and width stay free. What the exporter notes about the source (stack traces, file names, module
+names) is taken out, weights below the smallest normal float32 are set to zero (denormal numbers slow a processor down
+tenfold), and the file is put in place only after onnxruntime has reproduced the network on shapes it was not exported
+with.
+"""
+
+import copy
+import logging
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from torch import nn
+
+from turbnet.deploy.card import ModelCard
+from turbnet.deploy.seal import seal
+from turbnet.deploy.session import INPUT, OUTPUT, Model
+from turbnet.errors import InputError
+from turbnet.media.atomic import atomic_path
+
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Parity:
+    """Greatest absolute difference of onnxruntime and torch on one input shape (batch, frames, C, height, width)."""
+
+    shape: tuple[int, ...]
+    difference: float
+
+
+def export_onnx(module: nn.Module, card: ModelCard, path: str | Path) -> list[Parity]:
+    """Write `module` with its `card` to the ONNX file `path`; return the parity with torch, shape by shape.
+
+    Args:
+        module: (B, T, C, H, W) -> (B, T, C', H, W) float32, for any B, T >= 1 and H, W multiples of
+            `card.size_multiple`. A part of a network (its tilt removal alone, say) qualifies as well.
+        card: its digest is filled in on the way.
+
+    Raises:
+        InputError: the network cannot be exported, or onnxruntime differs from torch by more than 1e-4; nothing is
+            written then.
+    """
+    with atomic_path(path) as temporary:
+        module = flush_denormals(copy.deepcopy(module).cpu().float().eval())
+        model = _strip(_to_onnx(module, card))
+        for key, value in card.to_metadata().items():
+            model.metadata_props.add(key=key, value=value)
+        _check_no_local_path(model)
+        data = seal(model.SerializeToString())
+        try:
+            parity = compare(module, Model(data))
+        except InputError as error:
+            raise InputError(f"cannot export {card.architecture}: {error}") from error
+        for row in parity:
+            if not row.difference <= TOLERANCE:  # NaN fails too
+                raise InputError(
+                    f"cannot export {card.architecture}: onnxruntime and torch differ by {row.difference:.2g} "
+                    f"on frames of shape {row.shape}; at most {TOLERANCE:g} is accepted"
+                )
+        temporary.write_bytes(data)
+    return parity
+
+
+def compare(module: nn.Module, model: Model) -> list[Parity]:
+    """Run both on seeded noise of five shapes, none of them the export's."""
+    unit, channels = model.card.size_multiple, model.card.channels
+    generator = torch.Generator().manual_seed(0)
+    rows = []
+    for batch, frames, height, width in [
+        (1, 1, 4 * unit, 4 * unit),
+        (3, 1, 4 * unit, 7 * unit),
+        (1, 5, 9 * unit, 5 * unit),
+        (3, 2, 5 * unit, 4 * unit),
+        (1, model.card.frames + 1, 4 * unit, 11 * unit),
+    ]:
+        shape = (batch, frames, channels, height, width)
+        frames_BTCHW = torch.rand(shape, generator=generator)
+        with torch.no_grad():
+            expected = module(frames_BTCHW).numpy()
+        restored = model(frames_BTCHW.numpy())
+        same_shape = restored.shape == expected.shape
+        rows.append(Parity(shape, float(np.abs(restored - expected).max()) if same_shape else float("inf")))
+    return rows
+
+
+def flush_denormals(module: nn.Module) -> nn.Module:
+    """Set parameters and buffers below the smallest normal float32 (1.2e-38) to zero, in place."""
+    with torch.no_grad():
+        for tensor in (*module.parameters(), *module.buffers()):
+            if tensor.is_floating_point():
+                tensor[tensor.abs() < torch.finfo(torch.float32).tiny] = 0
+    return module
+
+
+def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
+    # Sizes of one would be baked in, equal sizes might be taken for one another.
+    shape = (2, max(card.frames, 3), card.channels, 6 * card.size_multiple, 8 * card.size_multiple)
+    free = {axis: torch.export.Dim.DYNAMIC for axis in (0, 1, 3, 4)}
+    try:
+        with _quiet():
+            program = torch.onnx.export(
+                module,
+                (torch.rand(shape, generator=torch.Generator().manual_seed(0)),),
+                dynamo=True,
+                input_names=[INPUT],
+                output_names=[OUTPUT],
+                dynamic_shapes=(free,),
+                external_data=False,
+                verbose=False,
+            )
+    except torch.onnx.OnnxExporterError as error:
+        cause = error.__cause__ or error
+        raise InputError(f"cannot export {card.architecture}: {str(cause).strip().splitlines()[0]}") from error
+    assert program is not None
+    return program.model_proto
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the exporter's remarks on optional packages and on its own deprecated calls."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def _strip(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Remove what the exporter says of the source, and name the free sizes."""
+    graph = model.graph
+    del model.metadata_props[:], graph.metadata_props[:], graph.value_info[:]
+    model.doc_string = graph.doc_string = ""
+    for item in (*graph.node, *graph.input, *graph.output, *graph.initializer):
+        item.doc_string = ""
+        del item.metadata_props[:]
+    for value in (*graph.input, *graph.output):
+        for axis, name in ((0, "batch"), (1, "frames"), (3, "height"), (4, "width")):
+            value.type.tensor_type.shape.dim[axis].dim_param = name
+    return model
+
+
+def _check_no_local_path(model: onnx.ModelProto) -> None:
+    bare = onnx.ModelProto()
+    bare.CopyFrom(model)
+    del bare.graph.initializer[:]
+    data = bare.SerializeToString()
+    for place in {Path.cwd(), Path.home(), Path(sys.prefix), Path(torch.__file__).parent, Path(__file__).parent}:
+        if len(place.parts) > 1 and str(place).encode() in data:
+            raise InputError(f"the file would tell of this machine: {place} stands in it; take it out of the card")

@@ -1,0 +1,141 @@
+"""Clips through a released network: file in, file out."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from turbnet.deploy.session import Model
+from turbnet.deploy.stream import stream, window_count
+from turbnet.deploy.tiling import Tiling
+from turbnet.errors import InputError, check_range
+from turbnet.media.clip import open_clip, open_writer
+
+TILE, OVERLAP = 384, 32
+
+
+@dataclass(frozen=True)
+class Restoration:
+    """What `restore_clip` did.
+
+    Args:
+        frames: frames restored; height, width: their size, pixels.
+        window: frames restored together.
+        tiles: tiles of a frame.
+        seconds: wall-clock time from the first frame read to the last one written.
+        network_seconds: the part of it spent inside the network.
+    """
+
+    frames: int
+    height: int
+    width: int
+    window: int
+    tiles: int
+    seconds: float
+    network_seconds: float
+
+    @property
+    def milliseconds_a_frame(self) -> float:
+        return 1e3 * self.seconds / self.frames
+
+
+def restore_frames(
+    frames: Iterable[np.ndarray],
+    network: Callable[[np.ndarray], np.ndarray],
+    tiling: Tiling,
+    window: int,
+) -> Iterator[np.ndarray]:
+    """Restore a clip frame by frame, in memory that depends on the window and not on the length of the clip.
+
+    Args:
+        frames: (H, W, C) each, float32 in [0, 1], sRGB-encoded.
+        network: (1, T, C, h, w) -> (1, T, C, h, w), a `Model` for instance.
+        window: frames restored together; successive windows share a quarter of it.
+
+    Yields:
+        (H, W, C) float32 in [0, 1], one for each frame that comes in.
+
+    Raises:
+        InputError: a frame holds values that are not finite, or the network returned such.
+    """
+
+    def planes() -> Iterator[np.ndarray]:
+        for index, frame_HWC in enumerate(frames):
+            if not np.isfinite(frame_HWC).all():
+                raise InputError(f"frame {index} holds values that are not numbers (NaN or infinite); repair the clip")
+            yield np.moveaxis(frame_HWC, -1, 0)
+
+    def restore_window(frames_TCHW: np.ndarray) -> np.ndarray:
+        return tiling.apply(network, frames_TCHW)
+
+    for index, restored_CHW in enumerate(stream(planes(), restore_window, window, window_overlap(window))):
+        if not np.isfinite(restored_CHW).all():
+            raise InputError(f"the network returned values that are not finite for frame {index}")
+        yield np.moveaxis(restored_CHW, 0, -1).clip(0, 1)
+
+
+def window_overlap(window: int) -> int:
+    """Frames that successive windows share."""
+    return window // 4
+
+
+def restore_clip(
+    source: str | Path,
+    destination: str | Path,
+    model: Model,
+    *,
+    crop: tuple[int, int, int, int] | None = None,
+    tile: int = TILE,
+    overlap: int | None = None,
+    window: int | None = None,
+    quiet: bool = True,
+) -> Restoration:
+    """Restore the clip in the file `source` into the file `destination`, which appears whole or not at all.
+
+    Args:
+        crop: (left, top, width, height), pixels; None: the whole frame.
+        tile: greatest side of a tile, pixels.
+        overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
+        window: frames restored together; None: what the model's card recommends.
+        quiet: no progress bar on standard error.
+
+    Raises:
+        InputError: the source cannot be read, the destination cannot be written, a parameter is out of range.
+    """
+    tiling = Tiling(tile, min(OVERLAP, tile // 4) if overlap is None else overlap, model.card.size_multiple)
+    window = int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
+    count, inside, start = 0, 0.0, time.perf_counter()
+    with (
+        open_clip(source, crop) as clip,
+        open_writer(destination, fps=clip.info.fps, grey=clip.info.grey) as writer,
+        _progress(quiet) as progress,
+    ):
+        info = clip.info
+        tiles = tiling.count(info.height, info.width)
+        windows = window_count(info.frames, window, window_overlap(window)) if info.frames else None
+        task = progress.add_task("restoring", total=windows and windows * tiles)
+
+        def network(frames_BTCHW: np.ndarray) -> np.ndarray:
+            nonlocal inside
+            began = time.perf_counter()
+            restored_BTCHW = model(frames_BTCHW)
+            inside += time.perf_counter() - began
+            progress.advance(task)
+            return restored_BTCHW
+
+        for frame_HWC in restore_frames(clip, network, tiling, window):
+            writer.write(frame_HWC)
+            count += 1
+    seconds = time.perf_counter() - start
+    return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside)
+
+
+def _progress(quiet: bool) -> Progress:
+    """A bar with the time left, gone when the work is done; none where no terminal shows it."""
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal)

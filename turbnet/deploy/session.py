@@ -1,0 +1,78 @@
+"""A released network at work: NumPy in, NumPy out. Needs onnxruntime only, neither torch nor onnx."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from turbnet.deploy.card import ModelCard
+from turbnet.deploy.seal import verify
+from turbnet.errors import InputError, check_range
+
+INPUT, OUTPUT = "frames", "restored"
+
+
+class Model:
+    """A network read from a sealed ONNX file.
+
+    Args:
+        data: the bytes of the file; the seal is checked before onnxruntime sees them.
+        threads: processor threads of one call; None: every core this process may use.
+
+    Raises:
+        InputError: the bytes are no turbnet model, were changed, or are beyond the installed onnxruntime.
+    """
+
+    def __init__(self, data: bytes, threads: int | None = None) -> None:
+        verify(data)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = int(check_range("threads", threads or available_cores(), 1, 1024))
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # errors reach the user as InputError, not through onnxruntime's log
+        # Activations that fade into denormal numbers slow a processor down tenfold.
+        options.add_session_config_entry("session.set_denormal_as_zero", "1")
+        try:
+            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's errors share no narrower base class
+            raise InputError(f"onnxruntime {onnxruntime.__version__} cannot run the model: {error}") from error
+        self.card = ModelCard.from_metadata(self._session.get_modelmeta().custom_metadata_map)
+
+    @classmethod
+    def load(cls, path: str | Path, threads: int | None = None) -> "Model":
+        """Read the model in the file `path`.
+
+        Raises:
+            InputError: names the file and what is wrong with it.
+        """
+        try:
+            return cls(Path(path).read_bytes(), threads)
+        except OSError as error:
+            raise InputError(f"cannot read the model {path}: {error.strerror or error}") from error
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def __call__(self, frames_BTCHW: np.ndarray) -> np.ndarray:
+        """Restore all frames at once: float32 (batch, frames, channels, height, width) in, the same shape out.
+
+        Raises:
+            InputError: the shape is not what the card asks for, or memory does not suffice.
+        """
+        card, shape = self.card, frames_BTCHW.shape
+        if len(shape) != 5 or shape[2] != card.channels or any(side % card.size_multiple for side in shape[3:]):
+            raise InputError(
+                f"frames of shape {shape}: the network takes (batch, frames, {card.channels}, height, width), "
+                f"height and width multiples of {card.size_multiple}"
+            )
+        try:
+            (restored_BTCHW,) = self._session.run([OUTPUT], {INPUT: np.ascontiguousarray(frames_BTCHW, np.float32)})
+        except Exception as error:  # as above
+            raise InputError(
+                f"onnxruntime failed on frames of shape {shape} ({error}); take smaller tiles or a shorter window"
+            ) from error
+        return restored_BTCHW
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

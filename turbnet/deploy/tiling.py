@@ -1,0 +1,120 @@
+"""Pictures of any size through a network of bounded memory: padding, overlapping tiles, smooth blending.
+
+A picture is padded by reflection to a multiple of what the network asks for, then cut into equal tiles that overlap.
+Along each axis a tile's weight rises and falls as a raised cosine,
+
+    w(k) = sin^2(pi/2 (k + 1/2) / n),   k = 0 ... n - 1 over an overlap of n pixels,
+
+whose mirror image is 1 - w, so neighbours' weights sum to one. A tile's weight is the product over both axes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+
+from turbnet.errors import check_range
+
+
+def raised_cosine(n: int) -> np.ndarray:
+    """The rising weights over an overlap of `n` samples, (n,) float64; `raised_cosine(n)[::-1] == 1 - itself`."""
+    return np.sin(np.pi / 2 * (np.arange(n) + 0.5) / n) ** 2
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Tiles along one axis: equal `length`, at `starts`, with `weights` (tiles, length) that sum to one everywhere."""
+
+    length: int
+    starts: list[int]
+    weights: np.ndarray
+
+    @classmethod
+    def cover(cls, size: int, tile: int, overlap: int, multiple: int) -> "Axis":
+        """Cover `size` (a multiple of `multiple`) with the fewest tiles no longer than `tile`.
+
+        The tiles are then made as short as that number allows, so little is computed twice.
+        """
+        tile = min(tile // multiple * multiple, size)
+        count = 1 if tile == size else ceil((size - overlap) / (tile - overlap))
+        length = ceil((size + (count - 1) * overlap) / count / multiple) * multiple
+        starts = [round(k * (size - length) / max(count - 1, 1)) for k in range(count)]
+
+        weights = np.ones((count, length))
+        for k in range(count - 1):
+            ramp = raised_cosine(starts[k] + length - starts[k + 1])
+            weights[k + 1, : len(ramp)] *= ramp
+            weights[k, length - len(ramp) :] *= ramp[::-1]
+        # Only where rounding makes three tiles meet is the sum not one already.
+        total = np.zeros(size)
+        for start, weight in zip(starts, weights, strict=True):
+            total[start : start + length] += weight
+        weights /= np.stack([total[start : start + length] for start in starts])
+        return cls(length, starts, weights)
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How pictures are cut for a network.
+
+    Args:
+        tile: greatest side of a tile, pixels, 32 to 8192 and at least 4 `multiple`.
+        overlap: least overlap of neighbours, pixels, 0 to tile/2.
+        multiple: sides the network accepts are multiples of this, pixels.
+
+    Raises:
+        ParameterError: a value is out of its range.
+    """
+
+    tile: int
+    overlap: int
+    multiple: int
+
+    def __post_init__(self) -> None:
+        check_range("tile", self.tile, max(32, 4 * self.multiple), 8192, "pixels")
+        check_range("overlap", self.overlap, 0, self.tile // 2 - self.multiple, "pixels")
+
+    def axes(self, height: int, width: int) -> tuple[Axis, Axis]:
+        """Tiles down and across a picture, in pixels of the padded picture."""
+        rows, columns = (
+            Axis.cover(self._padded(side), self.tile, self.overlap, self.multiple) for side in (height, width)
+        )
+        return rows, columns
+
+    def count(self, height: int, width: int) -> int:
+        """Number of tiles of a picture."""
+        rows, columns = self.axes(height, width)
+        return len(rows.starts) * len(columns.starts)
+
+    def apply(self, network: Callable[[np.ndarray], np.ndarray], frames_TCHW: np.ndarray) -> np.ndarray:
+        """Pass frames of any size through `network`, (1, T, C, h, w) -> (1, T, C', h, w), tile by tile.
+
+        Args:
+            frames_TCHW: float32; H and W at least 1.
+
+        Returns:
+            float32 (T, C', H, W).
+        """
+        frames, _, height, width = frames_TCHW.shape
+        padding = [(0, self._padded(side) - side) for side in (height, width)]
+        padded_TCHW = frames_TCHW
+        if padding != [(0, 0), (0, 0)]:  # np.pad would copy the whole window
+            padded_TCHW = np.pad(frames_TCHW, [(0, 0), (0, 0), *padding], mode="reflect")
+        rows, columns = self.axes(height, width)
+
+        blended_TCHW: np.ndarray | None = None
+        for top, weight_H in zip(rows.starts, rows.weights, strict=True):
+            for left, weight_W in zip(columns.starts, columns.weights, strict=True):
+                place = np.s_[:, :, top : top + rows.length, left : left + columns.length]
+                (restored_TCHW,) = network(padded_TCHW[place][None])
+                if blended_TCHW is None:
+                    shape = (frames, restored_TCHW.shape[1], *padded_TCHW.shape[2:])
+                    blended_TCHW = np.zeros(shape, np.float32)
+                blended_TCHW[place] += restored_TCHW * np.outer(weight_H, weight_W).astype(np.float32)
+        assert blended_TCHW is not None
+        return blended_TCHW[:, :, :height, :width]
+
+    def _padded(self, side: int) -> int:
+        """Next multiple, at least four of them, so that a network's coarsest scale still has neighbours to look at."""
+        return max(ceil(side / self.multiple), 4) * self.multiple

@@ -1,0 +1,28 @@
+"""Released networks by name."""
+
+from importlib import resources
+from pathlib import Path
+
+from turbnet.errors import InputError
+
+
+def released_models() -> dict[str, Path]:
+    """File of each released network, by name."""
+    folder = Path(str(resources.files("turbnet.weights")))
+    return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
+
+
+def find_model(name_or_path: str | Path) -> Path:
+    """The file of a model: a released one by its name, any other by its path.
+
+    Raises:
+        InputError: neither a released model nor a file; lists the released ones.
+    """
+    models = released_models()
+    if str(name_or_path) in models:
+        return models[str(name_or_path)]
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    names = ", ".join(models) or "none in this installation"
+    raise InputError(f"there is no model {name_or_path}: neither a file nor a released model ({names})")
