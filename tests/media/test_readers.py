@@ -166,6 +166,50 @@ def test_video_kinds(tmp_path, frames, name, codec, pixel_format, least):
     assert info.fps == pytest.approx(25, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("codec", "pixel_format"),
+    [("ffv1", "yuv420p10le"), ("ffv1", "yuv444p12le"), ("ffv1", "gray16le"), ("ffv1", "gray"), ("mjpeg", "yuvj444p")],
+)
+def test_black_and_white_keep_their_levels(tmp_path, codec, pixel_format):
+    frame = np.zeros((32, 64, 3), np.float32)
+    frame[:, 32:] = 1
+    encode(tmp_path / "a.avi", [frame], codec, pixel_format)
+    back, info = read_clip(tmp_path / "a.avi")
+    np.testing.assert_allclose(back[0, :, [16, 48]], [np.zeros((32, 3)), np.ones((32, 3))], atol=1.5 / 255)
+    assert info.grey == pixel_format.startswith("gray")
+
+
+def test_sixteen_bit_grey_video_is_exact(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 65536, (32, 48)).astype(np.uint16)
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "gray16le"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "gray16le")))
+        container.mux(stream.encode(None))
+    back, _ = read_clip(tmp_path / "a.mkv")
+    np.testing.assert_allclose(back[0], np.repeat(pixels[..., None], 3, axis=-1) / 65535, atol=1e-6)
+
+
+def test_turned_video_is_shown_upright(tmp_path, frames):
+    """The matrix (0, 1, -1, 0) of a telephone held upright: rotate by 90 degrees clockwise to show."""
+    write_clip(tmp_path / "a.mp4", frames)
+    content = bytearray((tmp_path / "a.mp4").read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 40
+    assert content[matrix : matrix + 36] == pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    content[matrix : matrix + 36] = pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 74 << 16, 0, 1 << 30)
+    plain, _ = read_clip(tmp_path / "a.mp4")
+    (tmp_path / "a.mp4").write_bytes(content)
+    back, info = read_clip(tmp_path / "a.mp4")
+    np.testing.assert_array_equal(back, np.rot90(plain, -1, axes=(1, 2)))
+    assert (info.height, info.width) == (100, 74)
+
+
+def test_name_with_a_colon(tmp_path, frames, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_clip("take2:1.mkv", frames)
+    assert len(read_clip("take2:1.mkv")[0]) == len(frames)
+
+
 def test_crop(tmp_path, frames):
     write_clip(tmp_path / "a.mkv", frames)
     back, info = read_clip(tmp_path / "a.mkv", crop=(11, 5, 40, 30))
@@ -252,6 +296,13 @@ def test_float_tiff_with_unusable_values(tmp_path, value, says):
     tifffile.imwrite(tmp_path / "a.tif", np.array([[0, value]], np.float32))
     with pytest.raises(InputError, match=says):
         read_clip(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("options", [{"truncate": True}, {"volumetric": True, "tile": (16, 16, 16)}])
+def test_tiff_whose_frames_share_a_page(tmp_path, options):
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((5, 16, 16), np.uint8), photometric="minisblack", **options)
+    with pytest.raises(InputError, match="save one page a frame"):
+        open_clip(tmp_path / "a.tif")
 
 
 def test_signed_tiff_has_no_white_level(tmp_path):
