@@ -5,7 +5,8 @@ memory at a time. Broken files raise InputError, at the latest when the pass com
 
 - A still, a folder, a GIF or a TIFF that cannot be decoded to its end.
 - A video whose decoder reports or conceals damage in a frame, or that ends before the frame count (MP4, MOV, AVI) or
-  the duration (MKV, WebM, FLV) its header declares. A container that declares neither (MPEG, TS) is taken as it is.
+  the duration (MKV, WebM, FLV; give or take two frames) that its header declares. A container that declares neither
+  (MPEG, TS) is taken as it is.
 
 Damage that decodes to a valid picture, as within uncompressed pixels or VP8, cannot be told from the picture.
 
@@ -26,7 +27,7 @@ import numpy as np
 import tifffile
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from turbnet.errors import InputError
 
@@ -58,6 +59,8 @@ class ClipInfo:
 
 @dataclass(frozen=True)
 class Source:
+    """A clip's header and a function that starts a pass over its frames."""
+
     info: ClipInfo
     frames: Callable[[], Iterator[Frame]]
 
@@ -133,7 +136,8 @@ def _rgb(pixels: NDArray[Any], path: Path) -> Frame:
 
 def _pillow(path: Path) -> Source:
     with _reading(path), Image.open(path) as image:
-        width, height = ImageOps.exif_transpose(image).size if image.getexif().get(0x0112, 1) > 4 else image.size
+        turned = image.getexif().get(ExifTags.Base.Orientation, 1) > 4
+        height, width = image.size if turned else image.size[::-1]
         moving = image.format in ("GIF", "WEBP", "PNG")
         count = getattr(image, "n_frames", 1) if moving else 1
         # Players show a frame without a duration for a tenth of a second.
