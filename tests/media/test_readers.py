@@ -16,9 +16,9 @@ def bytes_of(picture):
     return np.rint(picture * 255).astype(np.uint8)
 
 
-def encode(path, frames, codec, pixel_format, rate=25):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate)
+def encode(path, frames, codec, pixel_format, **options):
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream(codec, rate=25)
         stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], pixel_format
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(bytes_of(frame), "rgb24")))
@@ -331,3 +331,36 @@ def test_damage_in_the_middle_of_a_video(tmp_path, frames, name):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=name):
         read_clip(tmp_path / name)
+
+
+def test_damage_that_the_decoder_conceals(tmp_path, frames):
+    """MPEG-4 Part 2 paints over what it cannot decode and goes on; single bytes, so that it decodes every packet."""
+    encode(tmp_path / "a.avi", np.concatenate([frames] * 4), "mpeg4", "yuv420p")
+    content = bytearray((tmp_path / "a.avi").read_bytes())
+    with av.open(str(tmp_path / "a.avi")) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size > 200]
+    places = [packet.pos + packet.size // 2 for packet in packets]
+    for place in places:
+        content[place : place + 8] = b"\xff" * 8
+    (tmp_path / "a.avi").write_bytes(content)
+    with av.open(str(tmp_path / "a.avi")) as container:
+        assert any(frame.is_corrupt for frame in container.decode(video=0))  # it decodes, and is marked
+    with pytest.raises(InputError, match="is damaged near frame"):
+        read_clip(tmp_path / "a.avi")
+
+
+def test_frames_missing_after_a_whole_header(tmp_path, frames):
+    """A download cut off: the header, in front here, is whole, and so is every frame that came through."""
+    path = tmp_path / "a.mp4"
+    encode(path, np.concatenate([frames] * 4), "mpeg4", "yuv420p", movflags="faststart")
+    with av.open(str(path)) as container:
+        end = max(packet.pos + packet.size for packet in list(container.demux(video=0))[:15] if packet.size)
+    path.write_bytes(path.read_bytes()[:end])
+    assert open_clip(path).info.frames == 24
+    with pytest.raises(InputError, match="its header says 24 frames, 15 are there"):
+        read_clip(path)
+
+
+def test_frame_count_is_none_where_the_header_has_none(tmp_path, frames):
+    write_clip(tmp_path / "a.mkv", frames)
+    assert open_clip(tmp_path / "a.mkv").info.frames is None
