@@ -16,9 +16,9 @@ def bytes_of(picture):
     return np.rint(picture * 255).astype(np.uint8)
 
 
-def encode(path, frames, codec, pixel_format, rate=25):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate)
+def encode(path, frames, codec, pixel_format, **options):
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream(codec, rate=25)
         stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], pixel_format
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(bytes_of(frame), "rgb24")))
@@ -166,6 +166,50 @@ def test_video_kinds(tmp_path, frames, name, codec, pixel_format, least):
     assert info.fps == pytest.approx(25, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("codec", "pixel_format"),
+    [("ffv1", "yuv420p10le"), ("ffv1", "yuv444p12le"), ("ffv1", "gray16le"), ("ffv1", "gray"), ("mjpeg", "yuvj444p")],
+)
+def test_black_and_white_keep_their_levels(tmp_path, codec, pixel_format):
+    frame = np.zeros((32, 64, 3), np.float32)
+    frame[:, 32:] = 1
+    encode(tmp_path / "a.avi", [frame], codec, pixel_format)
+    back, info = read_clip(tmp_path / "a.avi")
+    np.testing.assert_allclose(back[0, :, [16, 48]], [np.zeros((32, 3)), np.ones((32, 3))], atol=1.5 / 255)
+    assert info.grey == pixel_format.startswith("gray")
+
+
+def test_sixteen_bit_grey_video_is_exact(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 65536, (32, 48)).astype(np.uint16)
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "gray16le"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "gray16le")))
+        container.mux(stream.encode(None))
+    back, _ = read_clip(tmp_path / "a.mkv")
+    np.testing.assert_allclose(back[0], np.repeat(pixels[..., None], 3, axis=-1) / 65535, atol=1e-6)
+
+
+def test_turned_video_is_shown_upright(tmp_path, frames):
+    """The matrix (0, 1, -1, 0) of a telephone held upright: rotate by 90 degrees clockwise to show."""
+    write_clip(tmp_path / "a.mp4", frames)
+    content = bytearray((tmp_path / "a.mp4").read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 40
+    assert content[matrix : matrix + 36] == pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    content[matrix : matrix + 36] = pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 74 << 16, 0, 1 << 30)
+    plain, _ = read_clip(tmp_path / "a.mp4")
+    (tmp_path / "a.mp4").write_bytes(content)
+    back, info = read_clip(tmp_path / "a.mp4")
+    np.testing.assert_array_equal(back, np.rot90(plain, -1, axes=(1, 2)))
+    assert (info.height, info.width) == (100, 74)
+
+
+def test_name_with_a_colon(tmp_path, frames, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_clip("take2:1.mkv", frames)
+    assert len(read_clip("take2:1.mkv")[0]) == len(frames)
+
+
 def test_crop(tmp_path, frames):
     write_clip(tmp_path / "a.mkv", frames)
     back, info = read_clip(tmp_path / "a.mkv", crop=(11, 5, 40, 30))
@@ -254,6 +298,13 @@ def test_float_tiff_with_unusable_values(tmp_path, value, says):
         read_clip(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize("options", [{"truncate": True}, {"volumetric": True, "tile": (16, 16, 16)}])
+def test_tiff_whose_frames_share_a_page(tmp_path, options):
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((5, 16, 16), np.uint8), photometric="minisblack", **options)
+    with pytest.raises(InputError, match="save one page a frame"):
+        open_clip(tmp_path / "a.tif")
+
+
 def test_signed_tiff_has_no_white_level(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((4, 4), np.int16))
     with pytest.raises(InputError, match="int16"):
@@ -280,3 +331,36 @@ def test_damage_in_the_middle_of_a_video(tmp_path, frames, name):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=name):
         read_clip(tmp_path / name)
+
+
+def test_damage_that_the_decoder_conceals(tmp_path, frames):
+    """MPEG-4 Part 2 paints over what it cannot decode and goes on; single bytes, so that it decodes every packet."""
+    encode(tmp_path / "a.avi", np.concatenate([frames] * 4), "mpeg4", "yuv420p")
+    content = bytearray((tmp_path / "a.avi").read_bytes())
+    with av.open(str(tmp_path / "a.avi")) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size > 200]
+    places = [packet.pos + packet.size // 2 for packet in packets]
+    for place in places:
+        content[place : place + 8] = b"\xff" * 8
+    (tmp_path / "a.avi").write_bytes(content)
+    with av.open(str(tmp_path / "a.avi")) as container:
+        assert any(frame.is_corrupt for frame in container.decode(video=0))  # it decodes, and is marked
+    with pytest.raises(InputError, match="is damaged near frame"):
+        read_clip(tmp_path / "a.avi")
+
+
+def test_frames_missing_after_a_whole_header(tmp_path, frames):
+    """A download cut off: the header, in front here, is whole, and so is every frame that came through."""
+    path = tmp_path / "a.mp4"
+    encode(path, np.concatenate([frames] * 4), "mpeg4", "yuv420p", movflags="faststart")
+    with av.open(str(path)) as container:
+        end = max(packet.pos + packet.size for packet in list(container.demux(video=0))[:15] if packet.size)
+    path.write_bytes(path.read_bytes()[:end])
+    assert open_clip(path).info.frames == 24
+    with pytest.raises(InputError, match="its header says 24 frames, 15 are there"):
+        read_clip(path)
+
+
+def test_frame_count_is_none_where_the_header_has_none(tmp_path, frames):
+    write_clip(tmp_path / "a.mkv", frames)
+    assert open_clip(tmp_path / "a.mkv").info.frames is None

@@ -72,6 +72,7 @@ def test_tensors_and_a_still_reference(clips):
         (np.zeros((20, 20, 3)), np.zeros((20, 21, 3)), 0, "cannot compare frames of shape"),
         (np.zeros((2, 20, 20, 3)), np.zeros((3, 20, 20, 3)), 0, "cannot compare frames of shape"),
         (np.zeros((20, 20)), np.zeros((20, 20)), 0, "cannot compare frames of shape"),
+        (np.zeros((20, 20, 3), np.uint8), np.zeros((20, 20, 3)), 0, "scale them to floating point"),
         (np.full((20, 20, 3), np.nan), np.zeros((20, 20, 3)), 0, "NaN"),
         (np.zeros((20, 20, 3)), np.full((20, 20, 3), np.nan), 0, "NaN"),
         (np.zeros((20, 20, 3)), np.zeros((20, 20, 3)), 10, "too small for a border of 10"),

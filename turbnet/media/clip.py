@@ -3,7 +3,7 @@
 A frame is float32 (H, W, 3), RGB in [0, 1], sRGB-encoded as stored; `turbnet.media.colour` makes it linear.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -23,7 +23,7 @@ class ClipReader:
     def __init__(self, path: Path, source: Source, crop: tuple[int, int, int, int] | None) -> None:
         self.path = path
         self._source = source
-        self._pass: Iterator[Frame] | None = None
+        self._pass: Generator[Frame, None, None] | None = None
         whole = source.info
         left, top, width, height = crop or (0, 0, whole.width, whole.height)
         inside = left >= 0 and top >= 0 and left + width <= whole.width and top + height <= whole.height
@@ -39,7 +39,7 @@ class ClipReader:
         self._pass = self._frames()
         return self._pass
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Generator[Frame, None, None]:
         whole = self._source.info
         for index, frame in enumerate(self._source.frames()):
             if frame.shape[:2] != (whole.height, whole.width):
@@ -53,14 +53,16 @@ class ClipReader:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._pass = None
+        if self._pass is not None:
+            self._pass.close()
 
 
 def open_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> ClipReader:
     """Open an image, a folder of images, a GIF, a multi-page TIFF or a video for reading.
 
     Args:
-        path: file or folder. Stills and TIFFs, which carry no rate, get 25 frames per second.
+        path: file or folder. Stills and TIFFs, which carry no rate, get 25 frames per second; a GIF's rate is that of
+            its first frame.
         crop: (left, top, width, height) in pixels; None: the whole picture.
 
     Raises:

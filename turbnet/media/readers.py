@@ -5,7 +5,8 @@ memory at a time. Broken files raise InputError, at the latest when the pass com
 
 - A still, a folder, a GIF or a TIFF that cannot be decoded to its end.
 - A video whose decoder reports or conceals damage in a frame, or that ends before the frame count (MP4, MOV, AVI) or
-  the duration (MKV, WebM, FLV) its header declares. A container that declares neither (MPEG, TS) is taken as it is.
+  the duration (MKV, WebM, FLV; give or take two frames) that its header declares. A container that declares neither
+  (MPEG, TS) is taken as it is.
 
 Damage that decodes to a valid picture, as within uncompressed pixels or VP8, cannot be told from the picture.
 
@@ -24,8 +25,9 @@ from typing import Any
 import av
 import numpy as np
 import tifffile
+from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from turbnet.errors import InputError
 
@@ -37,6 +39,10 @@ DEFAULT_FPS = 25.0
 
 # Filtering overshoots white by a little; twice white means that another scale was used.
 _LARGEST_FLOAT = 2.0
+# FFmpeg's fast conversion of subsampled colour darkens a picture by a level; this one is unbiased.
+_ACCURATE = (
+    Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
+)
 _GREY_MODES = {"1", "L", "LA", "La", "F", "I", "I;16", "I;16L", "I;16B", "I;16N"}
 
 
@@ -53,6 +59,8 @@ class ClipInfo:
 
 @dataclass(frozen=True)
 class Source:
+    """A clip's header and a function that starts a pass over its frames."""
+
     info: ClipInfo
     frames: Callable[[], Iterator[Frame]]
 
@@ -128,7 +136,8 @@ def _rgb(pixels: NDArray[Any], path: Path) -> Frame:
 
 def _pillow(path: Path) -> Source:
     with _reading(path), Image.open(path) as image:
-        width, height = ImageOps.exif_transpose(image).size if image.getexif().get(0x0112, 1) > 4 else image.size
+        turned = image.getexif().get(ExifTags.Base.Orientation, 1) > 4
+        height, width = image.size if turned else image.size[::-1]
         moving = image.format in ("GIF", "WEBP", "PNG")
         count = getattr(image, "n_frames", 1) if moving else 1
         # Players show a frame without a duration for a tenth of a second.
@@ -170,7 +179,7 @@ def _bytes_at(path: Path, offset: int, count: int) -> bytes:
 
 def _deep_png(path: Path) -> Iterator[Frame]:
     """A PNG of 16 bits a channel, which Pillow would cut to 8."""
-    with _reading(path), av.open(str(path)) as container:
+    with _reading(path), av.open(_ffmpeg_name(path)) as container:
         frame = next(container.decode(video=0))
         # PyAV hands out every 16-bit format but grey with alpha as it is.
         pixels = frame.to_ndarray(format="rgba64le" if frame.format.name.startswith("ya") else None)
@@ -187,6 +196,8 @@ def _tiff(path: Path) -> Source:
         pages = [page for page in tiff.pages if not _is_thumbnail(page)]
         if not pages:
             raise InputError(f"{path} holds no picture")
+        if tiff.series[0].is_truncated or tiff.series[0].keyframe.imagedepth > 1:
+            raise InputError(f"cannot read {path}: its frames share one page; save one page a frame")
         first: Any = pages[0].keyframe
         height, width = first.imagelength, first.imagewidth
         info = ClipInfo(len(pages), height, width, DEFAULT_FPS, first.samplesperpixel <= 2 and first.photometric < 2)
@@ -269,7 +280,7 @@ def _still(path: Path) -> Source:
 
 
 def _video(path: Path) -> Source:
-    with _reading(path), av.open(str(path)) as container:
+    with _reading(path), av.open(_ffmpeg_name(path)) as container:
         stream = _video_stream(container, path)
         context = stream.codec_context
         frame = next(container.decode(stream), None)
@@ -281,10 +292,15 @@ def _video(path: Path) -> Source:
         info = ClipInfo(stream.frames or None, height, width, float(rate or DEFAULT_FPS), grey)
 
     def frames() -> Iterator[Frame]:
-        with _reading(path), av.open(str(path)) as container:
+        with _reading(path), av.open(_ffmpeg_name(path)) as container:
             yield from _decode(container, path)
 
     return Source(info, frames)
+
+
+def _ffmpeg_name(path: Path) -> str:
+    """Absolute, so that FFmpeg never takes what precedes a colon for a protocol."""
+    return str(path.absolute())
 
 
 def _video_stream(container: Any, path: Path) -> Any:
@@ -325,10 +341,17 @@ def _declared_duration(container: Any, stream: Any) -> float:
 
 
 def _video_pixels(frame: Any, path: Path) -> Frame:
+    bits = max(component.bits for component in frame.format.components)
     if frame.format.name == "gray":
         pixels = frame.to_ndarray()
+    elif bits <= 8:
+        pixels = frame.reformat(format="rgb24", interpolation=_ACCURATE).to_ndarray()
     else:
-        deep = any(component.bits > 8 for component in frame.format.components)
-        pixels = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
-    # PyAV counts a display rotation anticlockwise, as NumPy does.
+        # FFmpeg brings deep YUV's white to 255 * 256, and n bits of grey by a shift to the upper end of 16.
+        yuv = len(frame.format.components) > 1 and not frame.format.is_rgb
+        shifted = ((1 << bits) - 1) << (16 - bits) if frame.format.name.startswith("gray") else 65535
+        white = np.float32(255 * 256 if yuv else shifted)
+        pixels = frame.reformat(format="rgb48le", interpolation=_ACCURATE).to_ndarray()
+        pixels = np.minimum(pixels / white, np.float32(1))
+    # A display rotation counts anticlockwise, as NumPy's does.
     return _rgb(np.rot90(pixels, frame.rotation // 90), path)

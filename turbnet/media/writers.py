@@ -29,6 +29,7 @@ from turbnet.media.atomic import atomic_path
 Pixels = NDArray[Any]
 
 _BT709 = 1
+_TIFF_PAGE = 4096  # bytes a page's directory takes at most
 _JPEG = {"quality": 95, "subsampling": 0}
 _LUMA = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
@@ -170,9 +171,13 @@ class _Tiff:
     def __init__(self, path: Path, fps: float, grey: bool) -> None:
         self.writer = tifffile.TiffWriter(path)
         self.photometric = "minisblack" if grey else "rgb"
+        self.bytes = 0
 
     def write(self, frame: Pixels) -> None:
         pixels = np.rint(frame * 65535.0).astype(np.uint16)
+        self.bytes += pixels.nbytes + _TIFF_PAGE
+        if self.bytes >= 2**32:
+            raise InputError("a TIFF holds no more than 4 GiB; write .mkv or a folder")
         self.writer.write(pixels, photometric=self.photometric, contiguous=False, metadata=None)
 
     def close(self) -> None:

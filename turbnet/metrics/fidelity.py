@@ -72,9 +72,17 @@ def _ssim(first_CHW: Tensor, second_CHW: Tensor) -> Tensor:
     return similarity_NCHW[..., _REACH:-_REACH, _REACH:-_REACH].mean()
 
 
+def _tensor(frames: Any) -> Tensor:
+    # A copy, since torch accepts neither read-only arrays nor reversed ones.
+    tensor = frames if isinstance(frames, Tensor) else torch.from_numpy(np.array(frames))
+    if not tensor.is_floating_point():
+        raise InputError(f"cannot compare frames of type {tensor.dtype}; scale them to floating point in [0, 1]")
+    return tensor
+
+
 def _prepare(restored: Any, reference: Any, border: int, smallest: int) -> tuple[Tensor, Tensor, Any]:
     """Both as floating-point (N, C, H, W), and what gives the scores (N,) the caller's shape and type."""
-    first, second = torch.as_tensor(restored), torch.as_tensor(reference)
+    first, second = _tensor(restored), _tensor(reference)
     if first.ndim < 3 or first.shape[-3:] != second.shape[-3:] or (second.ndim > 3 and first.shape != second.shape):
         raise InputError(
             f"cannot compare frames of shape {tuple(first.shape)} with {tuple(second.shape)}; "
