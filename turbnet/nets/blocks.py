@@ -12,6 +12,13 @@ def each_frame(module: nn.Module, clip_BTCHW: Tensor) -> Tensor:
     return out.unflatten(0, (batch, frames))
 
 
+def zero_start(layer: nn.Conv2d, bias: float = 0.0) -> None:
+    """Let a layer's output start as the constant `bias`: the network around it starts as its closed form."""
+    nn.init.zeros_(layer.weight)
+    if layer.bias is not None:
+        nn.init.constant_(layer.bias, bias)
+
+
 class ChannelNorm(nn.Module):
     """Layer normalisation over the channels of each pixel, computed in float32 whatever the input."""
 
@@ -35,7 +42,7 @@ class GatedConv(nn.Module):
         super().__init__()
         hidden = int(channels * expansion)
         self.expand = nn.Conv2d(channels, 2 * hidden, 1)
-        self.mix = nn.Conv2d(2 * hidden, 2 * hidden, 3, padding=1, groups=2 * hidden, padding_mode="replicate")
+        self.mix = nn.Conv2d(2 * hidden, 2 * hidden, 3, padding=1, groups=2 * hidden)
         self.contract = nn.Conv2d(hidden, channels, 1)
 
     def forward(self, x_NCHW: Tensor) -> Tensor:

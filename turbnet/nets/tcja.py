@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbnet.errors import ParameterError
-from turbnet.nets.blocks import ChannelNorm, GatedConv, each_frame
+from turbnet.nets.blocks import ChannelNorm, GatedConv, each_frame, zero_start
 
 _LOG_TEMPERATURE_MAX = 3.5  # logits within +-33: softmax stays well conditioned in every dtype
 
@@ -37,23 +37,28 @@ class JointAttention(nn.Module):
             raise ParameterError(f"groups = {groups} must divide channels = {channels}")
         self.groups = groups
         self.expand = nn.Conv2d(channels, 3 * channels, 1)
-        self.mix = nn.Conv2d(3 * channels, 3 * channels, 3, padding=1, groups=3 * channels, padding_mode="replicate")
+        self.mix = nn.Conv2d(3 * channels, 3 * channels, 3, padding=1, groups=3 * channels)
         self.project = nn.Conv2d(channels, channels, 1)
         self.log_temperature = nn.Parameter(torch.full((groups, 1), 1.5))
 
     def forward(self, x_BTCHW: Tensor) -> Tensor:
         batch, frames, channels, height, width = x_BTCHW.shape
         qkv = self.mix(self.expand(x_BTCHW.flatten(0, 1)))
-        # tokens: pixel, kind, (frame, group), channel within the group
-        tokens = qkv.reshape(batch, frames, 3, self.groups, channels // self.groups, height, width)
-        tokens = tokens.permute(2, 0, 5, 6, 1, 3, 4)
-        q, k, v = tokens.reshape(3, batch * height * width, frames * self.groups, channels // self.groups).unbind(0)
+        # Pixels first, channels last, in one cheap transpose; then a token is a (frame, group) of a pixel.
+        tokens = qkv.reshape(batch, frames * 3 * channels, height * width).transpose(1, 2)
+        tokens = tokens.reshape(batch * height * width, frames, 3, channels)
+        q, k, v = (part.reshape(-1, frames * self.groups, channels // self.groups) for part in tokens.unbind(2))
         temperature = self.log_temperature.clamp(max=_LOG_TEMPERATURE_MAX).exp().repeat(frames, 1)
-        q = F.normalize(q.float(), dim=-1, eps=1e-4) * temperature
-        k = F.normalize(k.float(), dim=-1, eps=1e-4)
+        q, k = _unit(q) * temperature, _unit(k)
         weights = torch.softmax(q @ k.transpose(-2, -1), dim=-1).to(v.dtype)
-        out = (weights @ v).reshape(batch, height, width, frames, channels)
-        return each_frame(self.project, out.permute(0, 3, 4, 1, 2))
+        out = (weights @ v).reshape(batch, height * width, frames * channels).transpose(1, 2)
+        return each_frame(self.project, out.reshape(batch, frames, channels, height, width))
+
+
+def _unit(x: Tensor) -> Tensor:
+    """x / |x| along the last axis in float32, safe at zero."""
+    x = x.float()
+    return x * torch.rsqrt(x.square().sum(-1, keepdim=True) + 1e-8)
 
 
 class _Block(nn.Module):
@@ -102,10 +107,8 @@ class TCJATransformer(nn.Module):
         self.blocks = nn.ModuleList(_Block(width, groups, expansion) for _ in range(depth))
         self.correct = nn.Conv2d(width, folded, 3, padding=1, padding_mode="replicate")
         self.gate = nn.Conv2d(width, patch**2, 3, padding=1, padding_mode="replicate")
-        for head in (self.correct, self.gate):
-            nn.init.zeros_(head.weight)
-            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
-        nn.init.constant_(self.gate.bias, -1.5)  # type: ignore[arg-type]  # starts near the temporal mean
+        zero_start(self.correct)
+        zero_start(self.gate, bias=-1.5)  # near the temporal mean
 
     def forward(self, frames_BTCHW: Tensor) -> Tensor:
         batch, count = frames_BTCHW.shape[:2]

@@ -2,10 +2,12 @@
 
 Turbulence moves the scene point u of frame t to u + t(u). The network estimates t coarse to fine (1/8, 1/4, 1/2 of the
 resolution) and undoes it by sampling each frame at x + t(x). At every level the reference is the temporal mean of the
-frames as registered so far, so it sharpens from level to level. Nothing depends on the number of frames.
+frames as registered so far, so it sharpens from level to level. A level takes the closed-form Lucas-Kanade step towards
+the reference and adds a learned correction; untrained, the network is a plain multiscale Lucas-Kanade registration.
+Nothing depends on the number of frames.
 
-After the tilt-removal stage of TMT (Zhang et al., IEEE TCI 2024), which supervises three scales with blur-only frames; here
-the reference is explicit and the frame count free.
+After the tilt-removal stage of TMT (Zhang et al., IEEE TCI 2024), which supervises three scales with blur-only frames;
+here the reference is explicit, the first guess is computed and not learned, and the frame count is free.
 """
 
 from collections.abc import Sequence
@@ -15,7 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbnet.nets.blocks import warp
+from turbnet.nets.blocks import warp, zero_start
+from turbnet.nets.lucas_kanade import lucas_kanade
 
 SCALES = (8, 4, 2)
 """Fractions of the resolution at which the tilt is estimated, coarse to fine."""
@@ -39,8 +42,9 @@ class _Level(nn.Module):
 
     def __init__(self, channels: int, width: int) -> None:
         super().__init__()
+        self.log_prior = nn.Parameter(torch.tensor(-7.0))
         self.layers = nn.Sequential(
-            nn.Conv2d(2 * channels + 2, width, 3, padding=1, padding_mode="replicate"),
+            nn.Conv2d(2 * channels + 4, width, 3, padding=1, padding_mode="replicate"),
             nn.GELU(),
             nn.Conv2d(width, width, 3, padding=1, padding_mode="replicate"),
             nn.GELU(),
@@ -48,11 +52,12 @@ class _Level(nn.Module):
             nn.GELU(),
         )
         self.correction = nn.Conv2d(width, 2, 3, padding=1, padding_mode="replicate")
-        nn.init.zeros_(self.correction.weight)  # starts as no tilt at all
-        nn.init.zeros_(self.correction.bias)  # type: ignore[arg-type]
+        zero_start(self.correction)
 
     def forward(self, registered_NCHW: Tensor, reference_NCHW: Tensor, tilt_N2HW: Tensor) -> Tensor:
-        return self.correction(self.layers(torch.cat((registered_NCHW, reference_NCHW, tilt_N2HW), dim=1)))
+        step = lucas_kanade(registered_NCHW, reference_NCHW, self.log_prior.clamp(-12.0, 0.0).exp())
+        step = step.to(registered_NCHW.dtype)
+        return step + self.correction(self.layers(torch.cat((registered_NCHW, reference_NCHW, tilt_N2HW, step), dim=1)))
 
 
 class TiltNet(nn.Module):
