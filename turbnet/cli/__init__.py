@@ -4,6 +4,7 @@ A verb's module is imported only when its verb runs, so that `restore` and `simu
 """
 
 import importlib
+import signal
 import sys
 
 VERBS = {
@@ -18,6 +19,8 @@ VERBS = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 a check failed, 2 the input cannot be used, 130 interrupted."""
+    # A job that is told to end still takes its half-written files with it.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 

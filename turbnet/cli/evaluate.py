@@ -44,6 +44,7 @@ def evaluate(
 
     from turbnet.media.atomic import check_output
     from turbnet.media.clip import open_clip
+    from turbnet.progress import progress_bar
     from turbnet.report import Report
 
     if json:
@@ -55,7 +56,7 @@ def evaluate(
             raise InputError(f"{_size(clip)} but {_size(target)}; both must have one size")
 
     scores = []
-    with _progress(quiet) as progress:
+    with progress_bar(quiet) as progress:
         scores.append(_score("restored", _pairs(clips[0], target), border, clips[0], progress))
         if input:
             mean = _TemporalMean()
@@ -140,15 +141,6 @@ def _score(
 
 def _size(clip: "ClipReader") -> str:
     return f"{clip.path} is {clip.info.width}x{clip.info.height} pixels"
-
-
-def _progress(quiet: bool) -> "Progress":
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal)
 
 
 def _table(scores: list[_Scores]) -> "Table":

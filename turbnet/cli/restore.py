@@ -25,16 +25,20 @@ def restore(
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar, no summary")] = False,
 ) -> None:
     """Restore a clip or an image seen through turbulence."""
+    from turbnet.cli.options import parse_crop
     from turbnet.deploy.restore import restore_clip
     from turbnet.deploy.session import Model
     from turbnet.deploy.weights import find_model
+    from turbnet.media.atomic import check_output
     from turbnet.report import Report, Row
 
+    if json:
+        check_output(json)
     done = restore_clip(
         source,
         output,
         Model.load(find_model(model), threads),
-        crop=_crop(crop) if crop else None,
+        crop=parse_crop(crop),
         tile=tile,
         window=window,
         quiet=quiet,
@@ -52,13 +56,3 @@ def restore(
     if not quiet:
         frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
         print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame")
-
-
-def _crop(text: str) -> tuple[int, int, int, int]:
-    from turbnet.errors import InputError
-
-    try:
-        left, top, width, height = (int(part) for part in text.split(","))
-    except ValueError as error:
-        raise InputError(f"--crop {text}: give left,top,width,height in pixels, such as 100,40,256,256") from error
-    return left, top, width, height

@@ -43,10 +43,13 @@ def simulate(
     from turbnet.atmosphere.profiles import Constant
     from turbnet.cli.options import parse_crop
     from turbnet.errors import InputError
+    from turbnet.media.atomic import check_output
     from turbnet.report import Report, Row
     from turbnet.simulate.sensor import Sensor
     from turbnet.simulate.write import write_simulation
 
+    if json is not None:
+        check_output(json)
     if cn2 is not None and d_over_r0 is not None:
         raise InputError("give --cn2 or --d-over-r0, not both: each decides the strength")
     if d_over_r0 is not None:

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from turbnet.deploy.session import Model
 from turbnet.deploy.stream import stream, window_count
 from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
+from turbnet.progress import progress_bar
 
 TILE, OVERLAP = 384, 32
 
@@ -112,7 +111,7 @@ def restore_clip(
     with (
         open_clip(source, crop) as clip,
         open_writer(destination, fps=clip.info.fps, grey=clip.info.grey) as writer,
-        _progress(quiet) as progress,
+        progress_bar(quiet) as progress,
     ):
         info = clip.info
         tiles = tiling.count(info.height, info.width)
@@ -132,10 +131,3 @@ def restore_clip(
             count += 1
     seconds = time.perf_counter() - start
     return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside)
-
-
-def _progress(quiet: bool) -> Progress:
-    """A bar with the time left, gone when the work is done; none where no terminal shows it."""
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal)

@@ -7,12 +7,12 @@ from itertools import islice, repeat
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import InputError, check_range
 from turbnet.media.atomic import atomic_path
 from turbnet.media.clip import open_clip, open_writer
+from turbnet.progress import progress_bar
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.simulator import Simulator
 from turbnet.simulate.stream import Frame, simulate_stream, to_frame
@@ -55,7 +55,7 @@ def write_simulation(
     check_range("seed", seed, 0, 2**62)
     if frames is not None:
         check_range("frames", frames, 1, 10**6)
-    with open_clip(source, crop=crop) as clip, ExitStack() as files:
+    with open_clip(source, crop=crop) as clip, progress_bar(quiet) as progress, ExitStack() as files:
         info = clip.info
         count = frames or (STILL_FRAMES if info.frames == 1 else info.frames)
         rate = fps or (30.0 if info.frames == 1 else info.fps)
@@ -82,7 +82,7 @@ def write_simulation(
             (folder / "path.json").write_text(json.dumps(_describe(path, rate, wind, seed), indent=2) + "\n")
         stream = simulate_stream(scenes(), simulator, seed, wind, rate, sensor, info.grey)
         written = 0
-        for seen in track(stream, "simulating", total=count, disable=quiet, transient=True):
+        for seen in progress.track(stream, total=count, description="simulating"):
             out.write(to_frame(seen.frames))
             if truth is not None:
                 blur_only.write(to_frame(seen.blur_only))
