@@ -20,23 +20,6 @@ EXACT = {  # quadrature of the Zernike-space covariance for SCENE, rad^2
 }
 
 
-def represented_covariance(field: ZernikeField, i: int, j: int, separations) -> np.ndarray:
-    """E[a_i(u) a_j(u')] for u - u' along x that the waves of `field` hold, summed without drawing any."""
-    order_i, order_j = (int(field._order[k - 2]) for k in (i, j))
-    half = np.full(field._size // 2 + 1, 2.0)
-    half[[0, -1]] = 1.0
-    x = np.asarray(separations)[:, None] * field.path.pixel
-
-    def total(radial, angle, k_x, weight):
-        energy = (radial[:, order_i].double() * radial[:, order_j].double()).sum(0).numpy()
-        product = energy * (angle[i - 2] * angle[j - 2].conj()).numpy() * weight
-        return (product.ravel() * np.exp(1j * x * k_x.numpy().ravel())).sum(1).real
-
-    on_grid = total(field._grid_radial, field._grid_angle, field._grid_k[0], half)
-    below = total(field._low_radial, field._low_angle, field._low_k[0], 2.0)
-    return on_grid + below + (field._common_tilt**2 if i == j and i in (2, 3) else 0.0)
-
-
 @pytest.fixture(scope="module")
 def field() -> ZernikeField:
     return ZernikeField(SCENE, 513, 513, modes=11)
@@ -45,7 +28,7 @@ def field() -> ZernikeField:
 @pytest.mark.parametrize("pair", EXACT)
 def test_covariance_over_the_whole_picture(field, pair):
     scale = np.sqrt(noll_covariance(pair[0], pair[0]) * noll_covariance(pair[1], pair[1])) * SCENE.d_over_r0 ** (5 / 3)
-    error = (represented_covariance(field, *pair, SEPARATIONS) - EXACT[pair]) / scale
+    error = (field.covariance(*pair, SEPARATIONS) - EXACT[pair]) / scale
     assert np.abs(error).max() < 0.02, error
 
 
@@ -59,7 +42,7 @@ def test_draws_have_the_covariance_that_the_waves_hold(field):
         for i, j in pairs:
             measured[i, j].append(float((a[i - 2][:, : -lag // 4] * a[j - 2][:, lag // 4 :]).mean()))
     for (i, j), values in measured.items():
-        expected = represented_covariance(field, i, j, [-lag])[0]
+        expected = field.covariance(i, j, [-lag])[0]
         error = np.std(values) / np.sqrt(draws)
         assert abs(np.mean(values) - expected) < 4 * error, (i, j)
         assert error < 0.25 * np.sqrt(noll_covariance(i, i) * noll_covariance(j, j)) * SCENE.d_over_r0 ** (5 / 3)
@@ -74,13 +57,13 @@ def test_single_point_variances_on_any_path(profile):
     path = OpticalPath(0.2034, 7000.0, profile, 525e-9)
     field = ZernikeField(path, 64, 64, modes=6, stride=2)
     expected = np.diag(noll_matrix(range(2, 7))) * path.d_over_r0 ** (5 / 3)
-    held = [represented_covariance(field, j, j, [0])[0] for j in range(2, 7)]
+    held = [field.covariance(j, j, [0])[0] for j in range(2, 7)]
     np.testing.assert_allclose(held, expected, rtol=0.02)
 
 
 def test_opposite_edges_are_not_tied_together(field):
     """Unpadded periodic sampling correlates opposite edges at 0.996; theory says 0.34 to 0.47 of the variance here."""
-    held = represented_covariance(field, 2, 2, [512])[0] / represented_covariance(field, 2, 2, [0])[0]
+    held = field.covariance(2, 2, [512])[0] / field.covariance(2, 2, [0])[0]
     assert held == pytest.approx(1.694 / 5.026, abs=0.02)
 
 

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from turbnet.atmosphere.noll import noll_covariance
 from turbnet.atmosphere.path import OpticalPath
+from turbnet.atmosphere.profiles import Array
 from turbnet.errors import ParameterError, check_range
 from turbnet.optics.zernike import angular, fourier_phase, fourier_radial, noll_to_nm
 from turbnet.simulate.waves import grid_weight, low_waves
@@ -140,9 +141,31 @@ class ZernikeField(nn.Module):
         keep("_low_k", d_k * np.stack((low.x, low.y)), torch.float32)
         keep("_layer_scale", path.distance / z, torch.float64)
 
-        represented = _variance_of_x_tilt(self)
-        exact = noll_covariance(2, 2) * path.d_over_r0 ** (5 / 3)
-        self._common_tilt = float(np.sqrt(max(exact - represented, 0.0)))
+        self._common_tilt = 0.0
+        missing = noll_covariance(2, 2) * path.d_over_r0 ** (5 / 3) - float(self.covariance(2, 2, 0.0))
+        self._common_tilt = float(np.sqrt(max(missing, 0.0)))
+
+    def covariance(self, i: int, j: int, x: Array | float, y: Array | float = 0.0) -> Array:
+        """E[a_i(u) a_j(u')] that this sampling holds, summed over its waves without drawing any, rad^2.
+
+        Args:
+            i, j: Noll indices, 2 .. modes.
+            x, y: u - u', pixels; arrays broadcast against each other.
+        """
+        at_x, at_y = (np.asarray(v, dtype=np.float64)[..., None] * self.path.pixel for v in np.broadcast_arrays(x, y))
+        pair = np.full((self._size, self._size // 2 + 1), 2.0)
+        pair[:, [0, -1]] = 1.0  # the zero and Nyquist columns are their own mirror images
+
+        def total(radial: Tensor, angle: Tensor, k: Tensor, count: Array | float) -> Array:
+            orders = (int(self._order[mode - 2]) for mode in (i, j))
+            first, second = (radial[:, order].double() for order in orders)
+            energy = (first * second).sum(0).numpy() * (angle[i - 2] * angle[j - 2].conj()).numpy() * count
+            k_x, k_y = (v.double().numpy().ravel() for v in k)
+            return np.asarray((np.exp(1j * (at_x * k_x + at_y * k_y)) @ energy.ravel()).real)
+
+        held = total(self._grid_radial, self._grid_angle, self._grid_k, pair)
+        held = held + total(self._low_radial, self._low_angle, self._low_k, 2.0)
+        return held + (self._common_tilt**2 if i == j and i in (2, 3) else 0.0)
 
     def draw(
         self,
@@ -247,15 +270,6 @@ def _radial_filters(
         for order in range(1, top_order + 1):
             filters[index, order] = amplitude * fourier_radial(order, reach)
     return filters
-
-
-def _variance_of_x_tilt(field: ZernikeField) -> float:
-    """Variance of a_2 that the waves of `field` hold, rad^2."""
-    half = np.full(field._size // 2 + 1, 2.0)
-    half[0] = half[-1] = 1.0  # the zero and Nyquist columns are their own mirror images
-    on_grid = (field._grid_radial[:, 1].double() ** 2).sum(0).numpy() * (field._grid_angle[0].abs() ** 2).numpy()
-    below = (field._low_radial[:, 1].double() ** 2).sum(0).numpy() * (field._low_angle[0].abs() ** 2).numpy()
-    return float((on_grid * half).sum() + 2 * below.sum())
 
 
 def _fast_even(size: int) -> int:
