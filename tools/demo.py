@@ -76,7 +76,14 @@ def look_through_turbulence(clean: np.ndarray) -> np.ndarray:
     """Frames (T, H, W, 3) of a still scene under a fresh breeze."""
     scene = torch.from_numpy(clean).permute(2, 0, 1).expand(1, FRAMES, 3, SIZE, SIZE)
     maker = PairMaker(
-        SIZE, SIZE, d_over_r0=(STRENGTH, STRENGTH), wind=(8.0, 8.0), independent=0.0, stride=4, components=20
+        SIZE,
+        SIZE,
+        d_over_r0=(STRENGTH, STRENGTH),
+        wind=(8.0, 8.0),
+        independent=0.0,
+        stride=4,
+        components=20,
+        margin=None,
     )
     return maker(scene, [2026]).frames[0].permute(0, 2, 3, 1).numpy()
 

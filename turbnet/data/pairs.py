@@ -43,7 +43,7 @@ class PairMaker(nn.Module):
         read_noise: range of the read noise, fraction of full scale.
         full_well: electrons at full scale, for shot noise.
         aperture, distance, wavelength: of the path, m; its Cn2 is constant and scaled to the strength.
-        modes, stride, components: of the simulator.
+        modes, stride, components, margin: of the simulator.
     """
 
     def __init__(
@@ -62,6 +62,7 @@ class PairMaker(nn.Module):
         modes: int = 36,
         stride: int = 8,
         components: int = 8,
+        margin: int | None = 8,
     ) -> None:
         super().__init__()
         for name, bounds in (("d_over_r0", d_over_r0), ("wind", wind), ("read_noise", read_noise)):
@@ -72,7 +73,7 @@ class PairMaker(nn.Module):
         self.wind, self.independent, self.frame_rate = wind, independent, frame_rate
         self.read_noise, self.full_well = read_noise, full_well
         path = OpticalPath.from_d_over_r0(max(self.strengths[1], 1e-3), aperture, distance, wavelength)
-        self.simulator = Simulator(path, height, width, modes, stride, components, self.strengths)
+        self.simulator = Simulator(path, height, width, modes, stride, components, self.strengths, margin=margin)
 
     @torch.no_grad()
     def forward(self, scene_BTCHW: Tensor, seeds: Sequence[int]) -> Pair:

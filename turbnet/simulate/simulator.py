@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from turbnet.atmosphere.noll import noll_covariance
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import InputError
 from turbnet.simulate.blur import KERNEL, PSFBasis, blur, blur_weights, psf_basis
@@ -56,6 +57,8 @@ class Simulator(nn.Module):
         components: PSF components beyond the mean.
         strengths: range of D/r0 for which the PSF basis is made; None: the path's own D/r0.
         sensor: the camera's noise.
+        margin: pixels beyond the picture's edge that are simulated too, rounded up to the stride; None: as far as light
+            can come from. With less, what comes from farther is missing, brightness kept (if `uniform`).
         uniform: keep a uniform scene uniform, as extended scenes of incoherent light are. False leaves the plain sum of
             point-spread functions, for scenes of points, whose energy it keeps.
     """
@@ -70,14 +73,15 @@ class Simulator(nn.Module):
         components: int = 20,
         strengths: tuple[float, float] | None = None,
         sensor: Sensor | None = None,
+        margin: int | None = None,
         uniform: bool = True,
     ) -> None:
         super().__init__()
         self.height, self.width, self.sensor, self.uniform = height, width, sensor or Sensor(), uniform
         weakest, strongest = strengths or (path.d_over_r0, path.d_over_r0)
-        # Light from beyond the edge reaches the picture by blur and by tilt: four standard deviations of it.
-        reach = 4 * TILT_PIXELS * (0.4489 * strongest ** (5 / 3)) ** 0.5
-        margin = KERNEL // 2 + int(reach)
+        if margin is None:
+            # Light from beyond the edge reaches the picture by blur and by tilt: four standard deviations of it.
+            margin = KERNEL // 2 + int(4 * TILT_PIXELS * (noll_covariance(2, 2) * strongest ** (5 / 3)) ** 0.5)
         self.margin = -(-margin // stride) * stride
         self.field = ZernikeField(path, height, width, self.margin, modes, stride)
         self.basis: PSFBasis = psf_basis(components if strongest > 0 else 0, weakest, strongest, modes)
