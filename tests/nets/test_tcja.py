@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from turbnet.errors import InputError, ParameterError
 from turbnet.nets import build
 from turbnet.nets.restorer import Restorer
-from turbnet.nets.tcja import JointAttention, TCJATransformer
+from turbnet.nets.tcja import JointAttention, TCJATransformer, _unit
 
 
 def trained(**more) -> TCJATransformer:
@@ -102,18 +102,25 @@ class TestJointAttention:
         torch.testing.assert_close(net(clip), torch.full_like(clip, 2.0))
 
     @pytest.mark.parametrize("scale", [0.0, 1e-6, 1.0, 1e6])
-    @pytest.mark.parametrize("temperature", [1.5, 50.0])
+    @pytest.mark.parametrize("temperature", [1.5, 100.0])
     def test_finite_for_any_size_of_input(self, scale, temperature):
         torch.manual_seed(3)
         net = JointAttention(8)
         with torch.no_grad():
-            net.log_temperature.fill_(temperature)  # held to its bound
+            net.log_temperature.fill_(temperature)  # exp(100) is infinite: held to its bound
+            net.expand.bias.zero_()
+            net.mix.bias.zero_()
         x = (scale * torch.randn(1, 3, 8, 4, 4)).requires_grad_()
         out = net(x)
         out.square().mean().backward()
         assert torch.isfinite(out).all()
         assert torch.isfinite(x.grad).all()
         assert all(torch.isfinite(p.grad).all() for p in net.parameters())
+
+    def test_queries_and_keys_have_unit_length_computed_in_float32(self):
+        """300 squared is above half precision's largest number, 65504."""
+        x = (300 * torch.randn(5, 8)).half()
+        torch.testing.assert_close(_unit(x), F.normalize(x.float(), dim=-1))
 
     def test_groups_must_divide_the_channels(self):
         with pytest.raises(ParameterError, match="groups = 3 must divide channels = 8"):
