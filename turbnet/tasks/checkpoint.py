@@ -23,9 +23,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, ValueError, OSError) as error:
-        raise InputError(
-            f"{path} is not a checkpoint that can be loaded safely: {str(error).splitlines()[0]}"
-        ) from error
+        why = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path} is not a checkpoint that can be loaded safely: {why}") from error
     hyper = checkpoint.get("hyper_parameters") if isinstance(checkpoint, dict) else None
     if not isinstance(hyper, dict) or not isinstance(hyper.get("net"), dict) or "state_dict" not in checkpoint:
         raise InputError(f"{path} is not a checkpoint of turbnet: it does not say which network it holds")

@@ -57,7 +57,7 @@ def _check_whole(config: dict[str, Any], name: str, low: int, high: int) -> None
     value: Any = config
     for part in name.split("."):
         value = value[part]
-    if value is not None and (not isinstance(value, int) or not low <= value <= high):
+    if not isinstance(value, int) or not low <= value <= high:
         raise InputError(f"{name} = {value!r} must be a whole number from {low} to {high}")
 
 
@@ -69,15 +69,12 @@ def fit(config: DictConfig) -> L.Trainer:
     """
     plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
     check_targets(plain)
-    for name, low, high in (
-        ("seed", 0, 2**32 - 1),
-        ("threads", 1, 2**10),
-        ("trainer.max_epochs", -1, 2**31),
-        ("trainer.max_steps", -1, 2**62),
-    ):
-        _check_whole(plain, name, low, high)
+    _check_whole(plain, "seed", 0, 2**32 - 1)
+    _check_whole(plain, "trainer.max_epochs", -1, 2**31)
+    _check_whole(plain, "trainer.max_steps", -1, 2**62)
     _quieten()
-    if plain["threads"]:
+    if plain["threads"] is not None:
+        _check_whole(plain, "threads", 1, 2**10)
         torch.set_num_threads(plain["threads"])
     L.seed_everything(plain["seed"], workers=True, verbose=False)
     data = instantiate(plain["data"], _convert_="all")

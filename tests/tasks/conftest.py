@@ -1,0 +1,78 @@
+"""Tasks and training runs that take seconds."""
+
+import csv
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+NET = {"name": "restorer", "tilt": {"widths": [4, 4, 4]}, "tcja": {"width": 8, "depth": 1}}
+SIMULATOR = {"height": 32, "width": 32, "modes": 10, "components": 3, "read_noise": [0.0, 0.0]}
+
+TINY = [
+    "threads=1",
+    "callbacks=quiet",
+    "data.size=32",
+    "data.frames=3",
+    "data.batch_size=2",
+    "data.steps_per_epoch=2",
+    "data.val_clips=2",
+    "trainer.max_epochs=2",
+    "trainer.log_every_n_steps=1",
+    "net.tilt.widths=[4,4,4]",
+    "net.tcja.width=8",
+    "net.tcja.depth=1",
+    "simulator.modes=10",
+    "simulator.components=3",
+]
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """Builds a configuration of a run of seconds: tiny(folder, overrides...)."""
+
+    def build(folder, *overrides):
+        with initialize_config_module("turbnet.configs", version_base="1.3"):
+            return compose("train", overrides=[*TINY, f"output={folder}", *overrides])
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def train(tiny):
+    """Runs it; returns the folder."""
+    from turbnet.tasks.fit import fit
+
+    def run(folder, *overrides):
+        fit(tiny(folder, *overrides))
+        return folder
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def weights():
+    """The network of a checkpoint."""
+
+    def load(path):
+        state = torch.load(path, weights_only=True)["state_dict"]
+        return {name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")}
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def curve():
+    """Rows of the csv log of a run."""
+
+    def read(folder):
+        with (folder / "csv" / "metrics.csv").open() as file:
+            return list(csv.DictReader(file))
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def stage_one(train, tmp_path_factory):
+    """The folder of a run of tilt removal."""
+    return train(tmp_path_factory.mktemp("stage_one"), "task=tilt")

@@ -1,0 +1,117 @@
+"""Tasks on one batch, without a trainer."""
+
+import pytest
+import skimage.data
+import torch
+
+from turbnet.errors import InputError, ParameterError
+from turbnet.tasks.restoration import Restoration
+from turbnet.tasks.tilt import TiltRemoval
+
+NET = {"name": "restorer", "tilt": {"widths": [8, 8, 8]}, "tcja": {"width": 16, "depth": 1}}
+SIMULATOR = {"height": 32, "width": 32, "modes": 10, "components": 3, "read_noise": [0.0, 0.0]}
+
+
+def make(kind, d_over_r0=(3.0, 3.0), **more):
+    torch.manual_seed(0)
+    task = kind(net=NET, simulator={**SIMULATOR, "d_over_r0": list(d_over_r0)}, **more)
+    task.report = lambda *values: None  # there is no trainer to log to
+    return task
+
+
+@pytest.fixture
+def batch():
+    picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
+    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3])}
+
+
+def learn(task, batch, steps, rate):
+    """Losses of steps with a warm-up of ten, as in training."""
+    optimiser = torch.optim.AdamW(list(task.trained()), lr=rate, betas=(0.9, 0.99))
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: min(1.0, (step + 1) / 10))
+    losses = []
+    for _ in range(steps):
+        loss = task.training_step(batch, 0)
+        losses.append(float(loss.detach()))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return losses
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.02])
+def test_tilt_removal_learns_one_clip_by_heart(batch, weight):
+    task = make(TiltRemoval, tilt_weight=weight)
+    losses = learn(task, batch, 60, 5e-3)
+    floor = 1e-3 + weight * 0.1  # the epsilons
+    assert losses[-1] - floor < 0.6 * (losses[0] - floor)
+
+
+def test_restoration_learns_one_clip_by_heart(batch):
+    losses = learn(make(Restoration), batch, 100, 2e-3)
+    floor = 1e-3 + 0.01 * 0.1 + 0.2 * 1e-3
+    assert losses[-1] - floor < 0.5 * (losses[0] - floor)
+
+
+@pytest.mark.parametrize("kind", [TiltRemoval, Restoration])
+@pytest.mark.parametrize("strength", [0.0, 10.0])
+def test_gradients_are_finite(kind, strength, batch):
+    task = make(kind, (strength, strength))
+    loss = task.training_step(batch, 0)
+    loss.backward()
+    assert torch.isfinite(loss)
+    for name, parameter in task.net.named_parameters():
+        assert parameter.grad is None or torch.isfinite(parameter.grad).all(), name
+
+
+@pytest.mark.parametrize(
+    ("task", "learns"),
+    [
+        (make(TiltRemoval), {"tilt"}),
+        (make(Restoration), {"tilt", "tcja"}),
+        (make(Restoration, freeze_tilt=True), {"tcja"}),
+    ],
+)
+def test_what_a_task_learns(task, learns, batch):
+    task.training_step(batch, 0).backward()
+    with_gradient = {name.split(".")[0] for name, p in task.net.named_parameters() if p.grad is not None}
+    assert with_gradient == learns
+    assert {name.split(".")[0] for name, p in task.net.named_parameters() if p.requires_grad} == learns
+    assert len(list(task.trained())) == sum(p.requires_grad for p in task.net.parameters())
+
+
+def test_frozen_tilts_have_no_weight_in_the_loss(batch):
+    from turbnet.tasks.losses import charbonnier
+
+    task = make(Restoration, freeze_tilt=True)
+    pair = task.pair(batch)
+    assert task.training_step(batch, 0) == charbonnier(task.net(pair.frames), pair.target)
+
+
+@pytest.mark.parametrize("kind", [TiltRemoval, Restoration])
+def test_validation_scores_the_input_too(kind, batch):
+    task, seen = make(kind), {}
+    task.report = lambda stage, values, clips: seen.update(stage=stage, clips=clips, **values)
+    task.validation_step(batch, 0)
+    assert seen["stage"] == "val"
+    assert seen["clips"] == 1
+    assert seen["psnr"] > seen["psnr_input"]  # an untrained net already registers
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"learning_rate": -1.0}, "learning_rate"),
+        ({"weight_decay": -1.0}, "weight_decay"),
+        ({"warmup": 2.0}, "warmup"),
+    ],
+)
+def test_out_of_range(more, says):
+    with pytest.raises(ParameterError, match=says):
+        make(TiltRemoval, **more)
+
+
+def test_clips_that_the_network_cannot_take():
+    with pytest.raises(InputError, match="width of the clips = 36 must be a multiple of 8"):
+        TiltRemoval(net=NET, simulator={**SIMULATOR, "width": 36})
