@@ -105,7 +105,9 @@ def test_resume_refuses_what_it_cannot_go_on_from(tiny, tmp_path, stage_one, mor
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\3\4 no archive"])
+@pytest.mark.parametrize(
+    "content", [b"", b"no checkpoint", b"PK\3\4 no archive", b"seed: 0\nthreads: 1\n", b"\x80\x02s"]
+)
 def test_a_file_that_is_no_checkpoint(tmp_path, content):
     path = tmp_path / "a.ckpt"
     path.write_bytes(content)
