@@ -19,6 +19,7 @@ from torch import Tensor
 
 from turbnet.atmosphere.noll import noll_matrix
 from turbnet.errors import check_range
+from turbnet.optics.pupil import circular, pupil_grid
 from turbnet.optics.zernike import zernike_basis
 from turbnet.simulate.tilt import upsample
 
@@ -35,13 +36,9 @@ def _pupil(modes: int) -> tuple[Tensor, Tensor, Tensor]:
 
     Counting samples at the rim by the part of their area inside makes sixteen across as good as many more.
     """
-    fine = 16
-    x = (np.arange(_PUPIL * fine) + 0.5) / (_PUPIL * fine / 2) - 1
-    inside = np.hypot(*np.meshgrid(x, x)) <= 1
-    part = inside.reshape(_PUPIL, fine, _PUPIL, fine).mean(axis=(1, 3))
-    x = (np.arange(_PUPIL) + 0.5) / (_PUPIL / 2) - 1
+    part = circular(_PUPIL, subsamples=16)
     rows, columns = np.nonzero(part)
-    y, x = x[rows], x[columns]
+    x, y = (axis[rows, columns] for axis in pupil_grid(_PUPIL))
     basis = zernike_basis(range(4, modes + 1), np.hypot(x, y), np.arctan2(y, x))
     index = torch.as_tensor(rows * 2 * _PUPIL + columns)
     return index, torch.as_tensor(part[rows, columns]), torch.as_tensor(basis)
