@@ -14,18 +14,33 @@ def main(arguments: list[str]) -> int:
     from omegaconf import DictConfig
     from omegaconf.errors import OmegaConfBaseException
 
+    refused = (InputError, HydraException, OmegaConfBaseException, OSError)
+    command = sys.argv[0]
+
     @hydra.main(version_base="1.3", config_path="pkg://turbnet.configs", config_name="train")
     def run(config: DictConfig) -> None:
         from turbnet.tasks.fit import fit
 
-        fit(config)
+        sys.argv = [command, "train", *arguments]  # from which further processes are started
+        try:
+            fit(config)
+        except refused as error:
+            raise SystemExit(2) from error  # Hydra adds lines of its own to an error, none to an exit
 
     sys.argv = ["turbnet train", *arguments]
     try:
         run()
-    except (HydraException, OmegaConfBaseException) as error:
-        cause = error.__cause__ if isinstance(error.__cause__, InputError) else error
-        raise InputError(str(cause).partition("\nfull_key")[0]) from error
+    except refused as error:
+        raise _in_words(error) from error
     except SystemExit as stop:
+        if isinstance(stop.__cause__, refused):
+            raise _in_words(stop.__cause__) from stop.__cause__
         return 2 if stop.code == 2 else int(bool(stop.code))
+    finally:
+        sys.argv = [command, *arguments]
     return 0
+
+
+def _in_words(error: BaseException) -> InputError:
+    cause = error.__cause__ if isinstance(error.__cause__, InputError) else error
+    return InputError(str(cause).partition("\nfull_key")[0])

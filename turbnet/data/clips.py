@@ -39,6 +39,9 @@ class CleanClips(Dataset[Scene]):
         check_range("clips of an epoch", length, 1, 2**31)
         check_range("frames", frames, 1, 10_000)
         check_range("moving", moving, 0, 1)
+        check_range("height", height, 1, 2**15, "pixels")
+        check_range("width", width, 1, 2**15, "pixels")
+        check_range("seed", seed, 0, 2**63)
         self.source, self.length, self.seed = source, length, seed
         self.frames, self.height, self.width, self.moving = frames, height, width, moving
 

@@ -8,6 +8,7 @@ from torch.utils.data import DataLoader
 
 from turbnet.data.clips import CleanClips, EpochSampler, Scene
 from turbnet.data.sources import Mixture, Pictures, Source, Text, embedded_paths, folder_paths
+from turbnet.errors import InputError, ParameterError, check_range
 
 
 class ClipData(L.LightningDataModule):
@@ -25,6 +26,9 @@ class ClipData(L.LightningDataModule):
         val_clips: clips to validate on, always the same.
         workers: processes that make clips; the clips do not depend on their number.
         seed: of the clips.
+
+    Raises:
+        InputError: a folder without pictures, a value out of range.
     """
 
     def __init__(
@@ -43,6 +47,14 @@ class ClipData(L.LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        check_range("batch_size", batch_size, 1, 2**16)
+        check_range("workers", workers, 0, 2**10)
+        check_range("text", text, 0, 1)
+        if len(scales) != 2 or not 0 < scales[0] <= scales[1] <= 1:
+            raise ParameterError(f"scales = {list(scales)} must be a range: two numbers, 0 < low <= high <= 1")
+        for name, paths in (("folders", folders), ("val_folders", val_folders)):
+            if isinstance(paths, str):
+                raise InputError(f"{name} = {paths!r} must be a list, such as [{paths}]")
         self.batch_size, self.workers = batch_size, workers
         ranges = (float(scales[0]), float(scales[1]))
 

@@ -44,6 +44,9 @@ class PairMaker(nn.Module):
         full_well: electrons at full scale, for shot noise.
         aperture, distance, wavelength: of the path, m; its Cn2 is constant and scaled to the strength.
         modes, stride, components, margin: of the simulator.
+
+    Raises:
+        ParameterError: a range or a number that is out of range.
     """
 
     def __init__(
@@ -65,10 +68,14 @@ class PairMaker(nn.Module):
         margin: int | None = 8,
     ) -> None:
         super().__init__()
-        for name, bounds in (("d_over_r0", d_over_r0), ("wind", wind), ("read_noise", read_noise)):
-            if len(bounds) != 2 or not 0 <= bounds[0] <= bounds[1]:
-                raise ParameterError(f"{name} = {list(bounds)} must be a range: two numbers, 0 <= low <= high")
+        for name, bounds, most in (("d_over_r0", d_over_r0, 100), ("wind", wind, 1000), ("read_noise", read_noise, 1)):
+            if len(bounds) != 2 or not 0 <= bounds[0] <= bounds[1] <= most:
+                raise ParameterError(
+                    f"{name} = {list(bounds)} must be a range: two numbers, 0 <= low <= high <= {most}"
+                )
         check_range("independent", independent, 0, 1)
+        check_range("frame_rate", frame_rate, 1e-3, 1e6, "frames a second")
+        check_range("full_well", full_well, 1, float("inf"), "electrons")
         self.strengths = (float(d_over_r0[0]), float(d_over_r0[1]))
         self.wind, self.independent, self.frame_rate = wind, independent, frame_rate
         self.read_noise, self.full_well = read_noise, full_well

@@ -10,10 +10,11 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from turbnet.data.text import render_text
 from turbnet.errors import InputError
+from turbnet.media.clip import open_clip
 
 Picture = NDArray[np.float32]
 
@@ -47,18 +48,15 @@ class Source(Protocol):
         ...
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)  # all embedded pictures; of a large folder, few enough for a small machine
 def load_picture(path: Path) -> Picture:
-    """An image file as (H, W, 3) float32 in [0, 1].
+    """An image file as (H, W, 3) float32 in [0, 1]; of several frames the first.
 
     Raises:
         InputError: it is no picture.
     """
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"cannot read the picture {path}: {error}") from error
+    with open_clip(path) as clip:
+        return next(iter(clip))
 
 
 def embedded_paths(split: str) -> list[Path]:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from turbnet.data.clips import Scene
 from turbnet.data.pairs import Pair, PairMaker
-from turbnet.errors import InputError
+from turbnet.errors import InputError, check_range
 from turbnet.nets import build
 from turbnet.nets.restorer import Restorer
 
@@ -29,6 +29,9 @@ class SimulatedTask(L.LightningModule):
         warmup: fraction of the steps.
         seed: training seed, for the record.
         recipe: anything else worth recording in the model card.
+
+    Raises:
+        InputError: a network that restores nothing, clips that it cannot take, a value out of range.
     """
 
     def __init__(
@@ -43,6 +46,9 @@ class SimulatedTask(L.LightningModule):
         **more: Any,
     ) -> None:
         super().__init__()
+        check_range("learning_rate", learning_rate, 0, 10)
+        check_range("weight_decay", weight_decay, 0, 10)
+        check_range("warmup", warmup, 0, 1)
         self.save_hyperparameters(
             {
                 "net": dict(net),
@@ -58,8 +64,16 @@ class SimulatedTask(L.LightningModule):
         restorer = build(net)
         if not isinstance(restorer, Restorer):
             raise InputError(f"this task trains a restorer; the network {net.get('name')!r} is none")
+        for side in ("height", "width"):
+            if simulator[side] % restorer.size_multiple:
+                raise InputError(
+                    f"{side} of the clips = {simulator[side]} must be a multiple of {restorer.size_multiple}"
+                )
         self.net = restorer
         self.pairs = PairMaker(**simulator)
+        self.net.requires_grad_(False)
+        for parameter in self.trained():
+            parameter.requires_grad_(True)
 
     def trained(self) -> Iterable[nn.Parameter]:
         """The parameters that this task learns."""
@@ -71,15 +85,17 @@ class SimulatedTask(L.LightningModule):
             return self.pairs(batch["scene"].float(), batch["seed"].tolist())
 
     def report(self, stage: str, values: Mapping[str, Tensor], clips: int) -> None:
-        """Log values under `stage/`."""
-        self.log_dict(
-            {f"{stage}/{name}": value.detach() for name, value in values.items()},
-            prog_bar=True,
-            on_step=stage == "train",
-            on_epoch=stage != "train",
-            batch_size=clips,
-            sync_dist=stage != "train",
-        )
+        """Log values under `stage/`; the progress bar shows the main ones."""
+        for name, value in values.items():
+            self.log(
+                f"{stage}/{name}",
+                value.detach(),
+                prog_bar=name in ("loss", "psnr"),
+                on_step=stage == "train",
+                on_epoch=stage != "train",
+                batch_size=clips,
+                sync_dist=stage != "train",
+            )
 
     def configure_optimizers(self) -> Any:
         """AdamW, linear warm-up, cosine decay to zero at the last step."""

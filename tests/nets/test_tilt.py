@@ -1,0 +1,99 @@
+import pytest
+import skimage.data
+import torch
+import torch.nn.functional as F
+
+from turbnet.data.pairs import PairMaker
+from turbnet.nets.blocks import warp
+from turbnet.nets.lucas_kanade import lucas_kanade
+from turbnet.nets.tilt import SCALES, TiltNet
+
+
+def trained(seed: int = 0) -> TiltNet:
+    """A net whose every weight takes part, as after training."""
+    torch.manual_seed(seed)
+    net = TiltNet(widths=(6, 5, 4))
+    with torch.no_grad():
+        for level in net.levels:
+            level.correction.weight.normal_(std=0.1)
+    return net.eval()
+
+
+@pytest.mark.parametrize(("batch", "frames", "height", "width"), [(1, 1, 8, 8), (3, 2, 24, 40), (1, 7, 72, 8)])
+def test_shapes(batch, frames, height, width):
+    out = trained()(torch.rand(batch, frames, 3, height, width))
+    assert out.frames.shape == (batch, frames, 3, height, width)
+    assert [tuple(t.shape) for t in out.tilts] == [(batch, frames, 2, height // s, width // s) for s in SCALES]
+
+
+@torch.no_grad()
+def test_order_of_frames_does_not_matter():
+    net, clip = trained(), torch.rand(1, 5, 3, 24, 24)
+    order = torch.tensor([3, 0, 4, 1, 2])
+    out, mixed = net(clip), net(clip[:, order])
+    torch.testing.assert_close(mixed.frames, out.frames[:, order], rtol=0, atol=1e-4)
+    torch.testing.assert_close(mixed.tilts[-1], out.tilts[-1][:, order], rtol=0, atol=1e-3)
+
+
+@torch.no_grad()
+def test_clips_of_a_batch_do_not_mix():
+    net, clips = trained(), torch.rand(2, 3, 3, 16, 24)
+    torch.testing.assert_close(net(clips).frames[1:], net(clips[1:]).frames, rtol=0, atol=1e-5)
+
+
+def test_channels_of_the_frames():
+    assert TiltNet(widths=(4, 4, 4), channels=1)(torch.rand(1, 2, 1, 16, 16)).frames.shape == (1, 2, 1, 16, 16)
+
+
+def lucas_kanade_pyramid(frames: torch.Tensor) -> torch.Tensor:
+    """Tilt at half resolution (T, 2, H/2, W/2) by coarse-to-fine Lucas-Kanade steps towards the mean of the frames."""
+    tilt = None
+    for scale in (8, 4, 2):
+        small = F.avg_pool2d(frames, scale)
+        if tilt is None:
+            tilt = torch.zeros(len(frames), 2, *small.shape[-2:])
+        else:
+            tilt = F.interpolate(tilt, scale_factor=2, mode="bilinear", align_corners=False)
+        registered = warp(small, tilt / scale)
+        tilt = tilt + scale * lucas_kanade(registered, registered.mean(0, keepdim=True), torch.tensor(-7.0).exp())
+    return tilt
+
+
+@pytest.fixture(scope="module")
+def pair():
+    scene = torch.from_numpy(skimage.data.astronaut()[96:192, 160:256].copy()).float().permute(2, 0, 1) / 255
+    maker = PairMaker(96, 96, d_over_r0=(2.0, 2.0), independent=1.0, read_noise=(0.0, 0.0), modes=15, components=4)
+    return maker(scene.expand(2, 10, 3, 96, 96), seeds=[5, 6])
+
+
+@torch.no_grad()
+def test_untrained_it_is_a_lucas_kanade_pyramid(pair):
+    out = TiltNet()(pair.frames)
+    for clip in range(2):
+        torch.testing.assert_close(out.tilts[-1][clip], lucas_kanade_pyramid(pair.frames[clip]), rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+def test_untrained_it_halves_the_tilt_and_the_distance_to_the_blur_only_frames(pair):
+    estimate = TiltNet()(pair.frames)
+    truth = F.avg_pool2d(pair.tilt.flatten(0, 1), 2).view_as(estimate.tilts[-1])
+    inner = (..., slice(4, -4), slice(4, -4))
+
+    def rms(x):
+        # What all frames share is another aim of the camera, and cannot be seen.
+        return float((x - x.mean(1, keepdim=True))[inner].square().mean().sqrt())
+
+    assert rms(estimate.tilts[-1] - truth) < 0.6 * rms(truth)
+    before = (pair.frames - pair.blur_only)[inner].square().mean()
+    after = (estimate.frames - pair.blur_only)[inner].square().mean()
+    assert after < 0.5 * before
+
+
+def test_every_weight_learns(pair):
+    net = trained()
+    out = net(pair.frames[:1, :3])
+    (out.frames.square().mean() + sum(t.square().mean() for t in out.tilts)).backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().sum() > 0, name
