@@ -50,6 +50,8 @@ def displacement(tilt_B2hw: Tensor, stride: int) -> Tensor:
 
 def carry(field_BChw: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
     """A field of the scene points seen where they went: f(x - d(x)), all on the coarse grid."""
+    if field_BChw.shape[1] == 0:
+        return field_BChw
     return sample(field_BChw, -displacement(tilt_B2hw, stride) / stride)
 
 
