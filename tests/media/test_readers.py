@@ -283,6 +283,18 @@ def test_bad_folders(tmp_path, picture):
         open_clip(tmp_path)
 
 
+def test_a_pattern_picks_pictures_of_a_folder(tmp_path, picture):
+    for name in ("frame2.png", "frame10.png", "frame1.png"):
+        write_clip(tmp_path / name, [picture])
+    write_clip(tmp_path / "other.png", [picture[1:]])
+    with pytest.raises(InputError, match="pattern such as"):
+        open_clip(tmp_path)
+    assert open_clip(tmp_path / "frame*.png").info.frames == 3
+    assert read_clip(tmp_path / "frame?.png")[0].shape == (2, *picture.shape)
+    with pytest.raises(InputError, match="no file matches"):
+        open_clip(tmp_path / "nothing*.png")
+
+
 def test_pages_of_mixed_sizes(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as tiff:
         tiff.write(np.zeros((4, 5), np.uint8))

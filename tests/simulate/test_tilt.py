@@ -3,7 +3,7 @@ import pytest
 import skimage.data
 import torch
 
-from turbnet.simulate.tilt import displacement, sample, tilt, upsample
+from turbnet.simulate.tilt import carry, displacement, sample, tilt, upsample
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,8 @@ def test_no_tilt_returns_the_picture(picture):
 def test_tiny_tilt_is_no_jump(picture):
     """Half-pixel misregistration would show here."""
     out = tilt(picture, torch.full((1, 2, 33, 33), 1e-4), 4)
-    assert float((out - picture).abs().max()) < 1e-4
+    # To the border, where light comes and goes.
+    assert float((out - picture)[..., 2:-2, 2:-2].abs().max()) < 1e-4
 
 
 def test_positive_tilt_moves_a_point_the_positive_way():
@@ -49,19 +50,34 @@ def test_displacement_inverts_the_tilt():
 
 def test_sampling_at_the_moved_points_undoes_it(picture):
     t = smooth_tilt(129, 129, 4, 1.5).float()
-    moved = tilt(picture, t, 4)
-    density = tilt(torch.ones_like(picture), t, 4)
-    back = sample(moved / density, upsample(t, 4, 129, 129))
+    moved = tilt(torch.cat((picture, torch.ones_like(picture)), 1), t, 4)
+    moved = moved[:, :1] / moved[:, 1:].clamp(min=1e-3)
+    back = sample(moved, upsample(t, 4, 129, 129))
     inner = (..., slice(8, -8), slice(8, -8))
-    assert float((back - picture)[inner].square().mean()) < 0.05 * float((moved - picture)[inner].square().mean())
+    assert float((back - picture)[inner].square().mean()) < 0.01 * float((moved - picture)[inner].square().mean())
 
 
 def test_energy_is_kept():
     scene = torch.zeros(1, 1, 129, 129, dtype=torch.float64)
     scene[..., 32:97, 32:97] = torch.rand(65, 65, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    scene = torch.nn.functional.avg_pool2d(scene, 5, 1, 2)
     out = tilt(scene, smooth_tilt(129, 129, 4, 1.5), 4)
-    assert float(out.sum() / scene.sum()) == pytest.approx(1.0, abs=2e-3)
+    assert float(out.sum() / scene.sum()) == pytest.approx(1.0, abs=1e-10)
+
+
+def test_points_that_cross_over_both_arrive():
+    scene = torch.zeros(1, 1, 1, 33)
+    scene[..., 12], scene[..., 20] = 1.0, 2.0
+    t = torch.zeros(1, 2, 1, 33)
+    t[:, 0, :, :16], t[:, 0, :, 16:] = 4.0, -4.0
+    out = tilt(scene, t, 1)
+    assert float(out[..., 16]) == pytest.approx(3.0, abs=1e-4)
+
+
+def test_a_field_is_carried_to_where_its_points_went():
+    t = torch.zeros(1, 2, 9, 9)
+    t[:, 0] = 8.0
+    f = torch.arange(9.0).expand(1, 1, 9, 9)
+    torch.testing.assert_close(carry(f, t, 4)[..., 2:], f[..., :-2], atol=1e-4, rtol=0)
 
 
 def test_gradients_in_picture_and_tilt():

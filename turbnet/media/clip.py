@@ -61,8 +61,8 @@ def open_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -
     """Open an image, a folder of images, a GIF, a multi-page TIFF or a video for reading.
 
     Args:
-        path: file or folder. Stills and TIFFs, which carry no rate, get 25 frames per second; a GIF's rate is that of
-            its first frame.
+        path: file, folder, or pattern of image files such as `frames/*.tif`. Stills and TIFFs, which carry no rate, get
+            25 frames per second; a GIF's rate is that of its first frame.
         crop: (left, top, width, height) in pixels; None: the whole picture.
 
     Raises:

@@ -66,9 +66,11 @@ class Source:
 
 
 def open_source(path: Path) -> Source:
-    """The reader for `path`: a folder, or a file known by its first bytes, or a video known by its extension."""
+    """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name."""
     if path.is_dir():
         return _folder(path)
+    if not path.exists() and any(sign in path.name for sign in "*?["):
+        return _sequence([picture for picture in path.parent.glob(path.name) if picture.is_file()], path)
     if not path.exists():
         raise InputError(f"there is no file or folder {path}")
     if path.stat().st_size == 0:
@@ -249,16 +251,25 @@ def _folder(path: Path) -> Source:
         entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     if not entries:
         raise InputError(f"the folder {path} is empty")
-    pictures = sorted((entry for entry in entries if entry.suffix.lower() in IMAGES), key=_natural)
+    pictures = [entry for entry in entries if entry.suffix.lower() in IMAGES]
     if not pictures:
         raise InputError(f"the folder {path} holds no images ({', '.join(sorted(IMAGES))})")
+    return _sequence(pictures, path)
+
+
+def _sequence(pictures: list[Path], path: Path) -> Source:
+    """Stills of one size in natural order of their names, found by the folder or pattern `path`."""
+    if not pictures:
+        raise InputError(f"no file matches {path}")
+    pictures = sorted(pictures, key=_natural)
     infos = [_still(picture).info for picture in pictures]
     first = infos[0]
     for picture, info in zip(pictures, infos, strict=True):
         if (info.height, info.width) != (first.height, first.width):
             raise InputError(
                 f"{picture} is {info.width}x{info.height} pixels but {pictures[0].name} is "
-                f"{first.width}x{first.height}; all images of a folder must have one size"
+                f"{first.width}x{first.height}; the images of a clip must have one size: "
+                f"pick them by a pattern such as '{picture.parent}/*{pictures[0].suffix}'"
             )
 
     def frames() -> Iterator[Frame]:

@@ -3,7 +3,8 @@ r"""The simulator: draw an atmosphere, tilt, blur, sense. Everything in linear i
 .. math::
     I = \mathrm{sensor}\left(\frac{B(T(J))}{B(T(1))}\right)
 
-Tilt first, blur second, both indexed by the source point (see `turbnet.simulate.tilt` and `.blur`). The denominator is
+Tilt first, blur second, both indexed by the source point (see `turbnet.simulate.tilt` and `.blur`): the blur of a point
+goes with it to where the tilt takes it. The denominator is
 what the same atmosphere makes of a uniform scene. Light from a point reaches the aperture with a brightness of its own
 (scintillation), which the phase-only model leaves out: it gives every point-spread function the sum one. But by
 reciprocity the sum over scene points of what they send to one image point is the energy that would return from there
@@ -24,7 +25,7 @@ from turbnet.errors import InputError
 from turbnet.simulate.blur import KERNEL, PSFBasis, blur, blur_weights, psf_basis
 from turbnet.simulate.field import TILT_PIXELS, Draw, ZernikeField
 from turbnet.simulate.sensor import Sensor
-from turbnet.simulate.tilt import tilt, upsample
+from turbnet.simulate.tilt import carry, tilt, upsample
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class Simulator(nn.Module):
         moved = tilt(padded, tilts, draw.stride)
         if bool(draw.coefficients.detach().any()):
             weights = blur_weights(high, self.basis)
-            seen = blur(moved, weights, self.basis, draw.stride)
+            seen = blur(moved, carry(weights, tilts, draw.stride), self.basis, draw.stride)
             unmoved = blur(padded, weights, self.basis, draw.stride)
         else:  # still air: the scene as it is; the aperture's own diffraction is part of every scene
             seen, unmoved = moved, padded

@@ -1,18 +1,21 @@
 r"""Tilt: every scene point u moves to u + t(u).
 
-Seen from the image, the light at x comes from the point u with u + t(u) = x. With the displacement d(x) = x - u that
-solves d(x) = t(x - d(x)), the tilted image of incoherent light is
-
 .. math::
-    T(J)(x) = J(x - d(x))\,|\det(I - \nabla d(x))|
+    T(J)(x) = \sum_u J(u)\, w(x - u - t(u))
 
-where the determinant keeps the energy of a scene that is locally compressed or stretched. Both d and the determinant are
-as smooth as t, so they are found on its coarse grid and interpolated.
+with w a bicubic kernel: each pixel's light is set down at u + t(u), between pixels, and nothing is lost. This is the
+adjoint of sampling an image at u + t(u), and its gradient is that sampling. Where neighbours cross over, both arrive.
+
+A field that belongs to scene points, such as their blur, moves along: at x it has the value of the point seen there,
+f(x - d(x)), with the displacement d(x) = t(x - d(x)). d is as smooth as t and is found on its coarse grid.
 """
+
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 _ITERATIONS = 12
 
@@ -27,20 +30,10 @@ def upsample(field_BChw: Tensor, stride: int, height: int, width: int) -> Tensor
     return fine[..., :height, :width]
 
 
-def sample(image_BCHW: Tensor, shift_B2HW: Tensor, mode: str = "bicubic") -> Tensor:
-    """image(x + shift(x)), shift in pixels, x then y; outside the picture its border goes on."""
-    *_, height, width = image_BCHW.shape
-    x = torch.arange(width, device=shift_B2HW.device, dtype=shift_B2HW.dtype)
-    y = torch.arange(height, device=shift_B2HW.device, dtype=shift_B2HW.dtype)[:, None]
-    # align_corners=True: pixel centres 0..N-1 map to -1..1, so no shift returns the image.
-    grid = torch.stack(
-        (
-            (x + shift_B2HW[:, 0]) * (2 / max(width - 1, 1)) - 1,
-            (y + shift_B2HW[:, 1]) * (2 / max(height - 1, 1)) - 1,
-        ),
-        dim=-1,
-    )
-    return F.grid_sample(image_BCHW, grid, mode=mode, padding_mode="border", align_corners=True)
+def sample(image_BCHW: Tensor, shift_B2HW: Tensor) -> Tensor:
+    """image(x + shift(x)), bicubic, shift in pixels, x then y; outside the picture its border goes on."""
+    grid = _grid(shift_B2HW)
+    return F.grid_sample(image_BCHW, grid, mode="bicubic", padding_mode="border", align_corners=True)
 
 
 def displacement(tilt_B2hw: Tensor, stride: int) -> Tensor:
@@ -51,31 +44,64 @@ def displacement(tilt_B2hw: Tensor, stride: int) -> Tensor:
     """
     shift = tilt_B2hw
     for _ in range(_ITERATIONS):
-        shift = sample(tilt_B2hw, -shift / stride, mode="bicubic")
+        shift = sample(tilt_B2hw, -shift / stride)
     return shift
 
 
-def jacobian(shift_B2hw: Tensor, stride: int) -> Tensor:
-    """|det(I - grad d)| on the coarse grid, (B, 1, h, w)."""
-    padded = F.pad(shift_B2hw, (1, 1, 1, 1), mode="replicate")
-    d_dx = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / (2 * stride)
-    d_dy = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / (2 * stride)
-    # The replicated border halves its one-sided difference; the margin of a draw keeps it out of the picture.
-    determinant = (1 - d_dx[:, 0]) * (1 - d_dy[:, 1]) - d_dx[:, 1] * d_dy[:, 0]
-    return determinant.abs()[:, None]
+def carry(field_BChw: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
+    """A field of the scene points seen where they went: f(x - d(x)), all on the coarse grid."""
+    if field_BChw.shape[1] == 0:
+        return field_BChw
+    return sample(field_BChw, -displacement(tilt_B2hw, stride) / stride)
 
 
 def tilt(image_BCHW: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
-    """Move every scene point u of the image to u + t(u).
+    """Move every scene point u of the image to u + t(u); light that leaves the picture is lost.
 
     Args:
         image_BCHW: linear intensities; differentiable.
-        tilt_B2hw: t on the coarse grid whose point (i, j) is pixel (i stride, j stride), pixels, x then y; differentiable.
+        tilt_B2hw: t on the coarse grid whose point (i, j) is pixel (i stride, j stride), in pixels, x then y;
+            differentiable.
         stride: step of that grid, pixels.
     """
     if not bool(tilt_B2hw.detach().any()):
         return image_BCHW
     *_, height, width = image_BCHW.shape
-    coarse = displacement(tilt_B2hw, stride)
-    fine = upsample(torch.cat((coarse, jacobian(coarse, stride)), dim=1), stride, height, width)
-    return sample(image_BCHW, -fine[:, :2]) * fine[:, 2:]
+    splat: Tensor = _Splat.apply(image_BCHW, _grid(upsample(tilt_B2hw, stride, height, width)))
+    return splat
+
+
+class _Splat(torch.autograd.Function):
+    """The adjoint of bicubic sampling, as torch has it in the backward pass of `grid_sample`."""
+
+    @staticmethod
+    def forward(ctx: Any, image_BCHW: Tensor, grid_BHW2: Tensor) -> Tensor:
+        ctx.save_for_backward(image_BCHW, grid_BHW2)
+        return _sampling_adjoint(image_BCHW, image_BCHW, grid_BHW2, (True, False))[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient_BCHW: Tensor) -> tuple[Tensor, Tensor]:
+        image_BCHW, grid_BHW2 = ctx.saved_tensors
+        sampled = F.grid_sample(gradient_BCHW, grid_BHW2, mode="bicubic", padding_mode="zeros", align_corners=True)
+        return sampled, _sampling_adjoint(image_BCHW, gradient_BCHW, grid_BHW2, (False, True))[1]
+
+
+def _sampling_adjoint(
+    gradient: Tensor, image: Tensor, grid: Tensor, wanted: tuple[bool, bool]
+) -> tuple[Tensor, Tensor]:
+    bicubic, zeros, align_corners = 2, 0, True
+    first, second = torch.ops.aten.grid_sampler_2d_backward(
+        gradient.contiguous(), image.contiguous(), grid, bicubic, zeros, align_corners, list(wanted)
+    )
+    return first, second
+
+
+def _grid(shift_B2HW: Tensor) -> Tensor:
+    """x + shift(x) in the coordinates of `grid_sample`: pixel centres 0..N-1 at -1..1."""
+    *_, height, width = shift_B2HW.shape
+    x = torch.arange(width, device=shift_B2HW.device, dtype=shift_B2HW.dtype)
+    y = torch.arange(height, device=shift_B2HW.device, dtype=shift_B2HW.dtype)[:, None]
+    columns = (x + shift_B2HW[:, 0]) * (2 / max(width - 1, 1)) - 1
+    rows = (y + shift_B2HW[:, 1]) * (2 / max(height - 1, 1)) - 1
+    return torch.stack((columns, rows), dim=-1)

@@ -1,0 +1,108 @@
+"""`turbnet simulate` as a user runs it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage.data
+from PIL import Image
+
+from turbnet.media.clip import read_clip, write_clip
+
+
+def simulate(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "turbnet", "simulate", *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("photo") / "photo.png"
+    Image.fromarray(skimage.data.astronaut()[40:97, 180:243]).save(path)
+    return path
+
+
+def test_a_photo_becomes_a_turbulent_clip_with_its_truth(tmp_path, photo):
+    path = ("--aperture", 0.2, "--distance", 7000, "--cn2", 1e-15)
+    done = simulate(tmp_path, photo, "-o", "clip.mkv", *path, "--frames", 4, "--truth", "truth", "--json", "path.json")
+    assert done.returncode == 0, done.stderr
+    frames, info = read_clip(tmp_path / "clip.mkv")
+    assert frames.shape == (4, 57, 63, 3)
+    assert info.fps == pytest.approx(30)
+    tilt = np.load(tmp_path / "truth/tilt.npy")
+    assert tilt.shape == (4, 2, 57, 63)
+    # sqrt(0.449 (D/r0)^(5/3)) rad, 4/pi pixels each; one clip of few frames scatters widely about it.
+    assert 0.3 < tilt.std() < 6
+    for name in ("blur_only", "tilt_only"):
+        assert read_clip(tmp_path / f"truth/{name}.mkv")[0].shape == frames.shape
+    rows = {row["name"]: row for row in json.loads((tmp_path / "path.json").read_text())["rows"]}
+    assert rows["D/r0"]["value"] == pytest.approx(4.19, abs=0.01)
+    assert rows["Fried parameter r0"]["unit"] == "m"
+
+
+def test_the_same_seed_gives_the_same_clip(tmp_path, photo):
+    clips = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert simulate(tmp_path, photo, "-o", f"{name}.mkv", "--frames", 2, "--seed", seed, "--quiet").returncode == 0
+        clips.append(read_clip(tmp_path / f"{name}.mkv")[0])
+    assert np.array_equal(clips[0], clips[1])
+    assert not np.array_equal(clips[0], clips[2])
+
+
+def test_still_air_changes_nothing(tmp_path, photo):
+    assert simulate(tmp_path, photo, "-o", "out.png", "--cn2", 0, "--frames", 1).returncode == 0
+    np.testing.assert_array_equal(Image.open(tmp_path / "out.png"), Image.open(photo))
+
+
+def test_frames_of_a_wind_are_coherent_and_independent_ones_are_not(tmp_path, photo):
+    jumps = []
+    for arguments in (("--wind", 0.5), ("--independent",)):
+        assert simulate(tmp_path, photo, "-o", "c.mkv", "--frames", 5, *arguments).returncode == 0
+        clip, _ = read_clip(tmp_path / "c.mkv")
+        jumps.append(float(np.abs(np.diff(clip, axis=0)).mean()))
+    assert jumps[0] < 0.5 * jumps[1]
+
+
+def test_a_grey_clip_stays_grey_and_keeps_its_frames(tmp_path):
+    rng = np.random.default_rng(0)
+    grey = np.repeat(rng.random((3, 24, 20, 1), dtype=np.float32), 3, axis=3)
+    write_clip(tmp_path / "grey.tif", grey, grey=True)
+    assert simulate(tmp_path, "grey.tif", "-o", "out.tif", "--d-over-r0", 1).returncode == 0
+    frames, info = read_clip(tmp_path / "out.tif")
+    assert frames.shape == grey.shape
+    assert info.grey
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("missing.png", "-o", "out.mkv"), "missing.png"),
+        (("PHOTO", "-o", "out.xyz"), "out.xyz"),
+        (("PHOTO", "-o", "no/such/folder/out.mkv"), "folder"),
+        (("PHOTO", "-o", "out.mkv", "--cn2", "-1e-15"), "Cn2"),
+        (("PHOTO", "-o", "out.mkv", "--wavelength", "525"), "wavelength"),
+        (("PHOTO", "-o", "out.mkv", "--cn2", "1e-15", "--d-over-r0", "2"), "not both"),
+        (("PHOTO", "-o", "out.mkv", "--frames", "0"), "frames"),
+        (("PHOTO", "-o", "out.mkv", "--crop", "1,2,3"), "--crop"),
+        (("PHOTO", "-o", "out.mkv", "--crop", "0,0,1000,1000"), "crop"),
+        (("PHOTO", "-o", "out.mkv", "--frobnicate"), "frobnicate"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, photo, arguments, complaint):
+    done = simulate(tmp_path, *(photo if a == "PHOTO" else a for a in arguments))
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert complaint in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_it_never_imports_lightning(tmp_path, photo):
+    code = (
+        "import sys; from turbnet.cli import run; "
+        f"code = run(['simulate', {str(photo)!r}, '-o', 'o.png', '--frames', '1', '--quiet']); "
+        "assert not any(name.split('.')[0] == 'lightning' for name in sys.modules); sys.exit(code)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False).returncode == 0
