@@ -16,8 +16,8 @@ class ClipData(L.LightningDataModule):
 
     Args:
         frames, size: of a clip; crops are size x size pixels.
-        batch_size: clips of a step.
-        steps_per_epoch: training steps of an epoch; every epoch brings fresh clips.
+        batch_size: clips of a step, in each process.
+        steps_per_epoch: training steps of an epoch, which several processes share; every epoch brings fresh clips.
         folders: of the user's pictures, searched recursively; empty: the pictures embedded in scikit-image.
         val_folders: the same for validation.
         text: fraction of clips with rendered text.
