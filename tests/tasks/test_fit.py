@@ -7,6 +7,7 @@ from omegaconf import OmegaConf
 from turbnet.errors import InputError
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
 from turbnet.tasks.fit import check_targets, fit
+from turbnet.tasks.tilt import TiltRemoval
 
 
 def plain(value) -> bool:
@@ -66,6 +67,21 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(train, tmp_path, weights
     rows = [row for row in curve(whole) if int(row["epoch"] or -1) >= 2]
     assert len(rows) >= 6
     assert rows == [row for row in curve(resumed) if int(row["epoch"] or -1) >= 2]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_every_epoch_trains_on_fresh_clips(train, tmp_path, monkeypatch, workers):
+    seen = []
+
+    class Noted(TiltRemoval):
+        def training_step(self, batch, index):
+            seen.extend(batch["seed"].tolist())
+            return super().training_step(batch, index)
+
+    Noted.__module__ = TiltRemoval.__module__  # only classes of the package may be named
+    monkeypatch.setattr("turbnet.tasks.tilt.TiltRemoval", Noted)
+    train(tmp_path, "task=tilt", "trainer.max_epochs=3", f"data.workers={workers}")
+    assert len(seen) == len(set(seen)) == 12
 
 
 def test_the_seed_decides_the_run(train, tmp_path, stage_one, weights):
