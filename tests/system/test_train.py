@@ -1,8 +1,10 @@
 """`turbnet train` as a user runs it, from a folder of their own."""
 
 import csv
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -203,3 +205,21 @@ def test_two_processes_take_the_step_of_one(command, tmp_path, experiment):
         torch.testing.assert_close(
             two[name], one[name], rtol=0, atol=1e-6, msg=lambda text, name=name: f"{name}: {text}"
         )
+
+
+def test_an_interrupted_run_says_so_and_leaves_a_checkpoint_to_resume_from(tmp_path):
+    arguments = [*SECONDS, "trainer.max_epochs=100000", "output=run"]
+    whole = [sys.executable, "-m", "turbnet", "train", *arguments]
+    with subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        try:
+            last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+            until = time.monotonic() + 120
+            while not last.exists() and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.2)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 130, err
+    assert err.endswith("turbnet train: interrupted\n")
+    assert weights(tmp_path / "run")

@@ -35,6 +35,8 @@ def main(arguments: list[str]) -> int:
     except SystemExit as stop:
         if isinstance(stop.__cause__, refused):
             raise _in_words(stop.__cause__) from stop.__cause__
+        if isinstance(stop.__context__, KeyboardInterrupt):  # lightning makes an exit of it
+            raise KeyboardInterrupt from stop
         return 2 if stop.code == 2 else int(bool(stop.code))
     finally:
         sys.argv = [command, *arguments]
