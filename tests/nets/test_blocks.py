@@ -49,6 +49,7 @@ class TestWarp:
         assert out.dtype == torch.bfloat16
         torch.testing.assert_close(out.float(), warp(image, torch.full((1, 2, 2, 2048), 0.25)), rtol=0.01, atol=1e-3)
 
+    @pytest.mark.filterwarnings("ignore:.*double precision")
     def test_gradients_of_image_and_flow(self):
         generator = torch.Generator().manual_seed(0)
         image = torch.rand(1, 1, 4, 5, generator=generator, requires_grad=True)

@@ -73,6 +73,7 @@ def test_gradients_are_finite(scene):
     assert torch.isfinite(prior.grad)
 
 
+@pytest.mark.filterwarnings("ignore:.*double precision")
 def test_gradient_is_that_of_finite_differences():
     """In float32, in which the step is always computed; steps and tolerances are chosen for that."""
     image = waves(0.3)[..., :6, :6].clone().requires_grad_()
