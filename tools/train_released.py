@@ -50,7 +50,7 @@ def main() -> None:
     subprocess.run([sys.executable, "-m", "turbnet", "train", *arguments], check=True)
 
     network, hyper_parameters = load_network(last)
-    steps = read_steps(options.output / "csv" / "metrics.csv")
+    steps = read_steps(options.output / "csv")
     hyper_parameters["recipe"] = {
         "data": options.data,
         "recipe": "python tools/train_released.py --pictures FOLDER",
@@ -70,10 +70,13 @@ def main() -> None:
     print(path.with_suffix(".md").read_text())
 
 
-def read_steps(curve: Path) -> int:
-    """Training steps taken, by the curve on disk."""
-    with curve.open() as rows:
-        return 1 + max(int(row["step"]) for row in csv.DictReader(rows))
+def read_steps(curves: Path) -> int:
+    """Training steps taken, by the curves of all legs."""
+    steps = []
+    for curve in curves.glob("*/metrics.csv"):
+        with curve.open() as rows:
+            steps += [int(row["step"]) for row in csv.DictReader(rows)]
+    return 1 + max(steps)
 
 
 def quality(network: torch.nn.Module, source: Source, strength: float) -> str:

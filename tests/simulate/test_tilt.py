@@ -3,6 +3,7 @@ import pytest
 import skimage.data
 import torch
 
+from turbnet.errors import InputError
 from turbnet.simulate.tilt import carry, displacement, sample, tilt, upsample
 
 
@@ -94,3 +95,10 @@ def test_odd_sizes(height, width):
     out = tilt(scene, t, 4)
     assert out.shape == scene.shape
     assert torch.isfinite(out).all()
+
+
+def test_a_tilt_that_is_not_a_number_is_refused(picture):
+    t = torch.zeros(1, 2, 33, 33)
+    t[0, 0, 5, 5] = float("nan")
+    with pytest.raises(InputError, match="tilt"):
+        tilt(picture, t, 4)

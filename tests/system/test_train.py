@@ -62,7 +62,7 @@ def first(tmp_path_factory):
 
 
 def rows(run):
-    with (run / "csv" / "metrics.csv").open() as file:
+    with (run / "csv" / "version_0" / "metrics.csv").open() as file:
         return list(csv.DictReader(file))
 
 
@@ -84,7 +84,7 @@ def test_outputs(first):
     run, *_ = first
     assert {path.name for path in run.iterdir()} >= {"config.yaml", "csv", "tensorboard", "checkpoints"}
     assert {path.name for path in (run / "checkpoints").iterdir()} == {"epoch0000.ckpt", "last.ckpt"}
-    assert list((run / "tensorboard").glob("events.*"))
+    assert list((run / "tensorboard/version_0").glob("events.*"))
     config = OmegaConf.load(run / "config.yaml")
     assert config.data.size == 32
     assert config.simulator.height == 32  # resolved

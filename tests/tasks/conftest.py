@@ -66,7 +66,7 @@ def curve():
     """Rows of the csv log of a run."""
 
     def read(folder):
-        with (folder / "csv" / "metrics.csv").open() as file:
+        with (folder / "csv" / "version_0" / "metrics.csv").open() as file:
             return list(csv.DictReader(file))
 
     return read

@@ -27,7 +27,7 @@ def test_a_run_leaves_what_it_says(stage_one, curve):
     assert "last.ckpt" in checkpoints
     assert len(checkpoints) == 2  # and the best
     assert not any("=" in name for name in checkpoints)  # an override could not name it
-    assert list((stage_one / "tensorboard").glob("events.*"))
+    assert list((stage_one / "tensorboard/version_0").glob("events.*"))
     assert OmegaConf.load(stage_one / "config.yaml").data.size == 32
     rows = curve(stage_one)
     assert sum(bool(row["train/loss"]) for row in rows) == 4
@@ -67,6 +67,14 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(train, tmp_path, weights
     rows = [row for row in curve(whole) if int(row["epoch"] or -1) >= 2]
     assert len(rows) >= 6
     assert rows == [row for row in curve(resumed) if int(row["epoch"] or -1) >= 2]
+
+
+def test_resuming_into_the_same_folder_keeps_the_first_curve(train, tmp_path, curve):
+    run = train(tmp_path / "run", "trainer.max_epochs=1")
+    before = curve(run)
+    train(run, "trainer.max_epochs=2", f"resume={run}/checkpoints/last.ckpt")
+    assert curve(run) == before
+    assert (run / "csv/version_1/metrics.csv").is_file()
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from turbnet.atmosphere.noll import noll_covariance
 from turbnet.atmosphere.path import OpticalPath
-from turbnet.errors import InputError
+from turbnet.errors import InputError, check_range
 from turbnet.simulate.blur import KERNEL, PSFBasis, blur, blur_weights, psf_basis
 from turbnet.simulate.field import TILT_PIXELS, Draw, ZernikeField
 from turbnet.simulate.sensor import Sensor
@@ -80,6 +80,7 @@ class Simulator(nn.Module):
         super().__init__()
         self.height, self.width, self.sensor, self.uniform = height, width, sensor or Sensor(), uniform
         weakest, strongest = strengths or (path.d_over_r0, path.d_over_r0)
+        check_range("stride", stride, 1, 64, "pixels")
         if margin is None:
             # Light from beyond the edge reaches the picture by blur and by tilt: four standard deviations of it.
             margin = KERNEL // 2 + int(4 * TILT_PIXELS * (noll_covariance(2, 2) * strongest ** (5 / 3)) ** 0.5)

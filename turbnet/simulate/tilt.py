@@ -17,6 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from turbnet.errors import InputError
+
 _ITERATIONS = 12
 
 
@@ -63,9 +65,14 @@ def tilt(image_BCHW: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
         tilt_B2hw: t on the coarse grid whose point (i, j) is pixel (i stride, j stride), in pixels, x then y;
             differentiable.
         stride: step of that grid, pixels.
+
+    Raises:
+        InputError: the tilt holds values that are not finite.
     """
     if not bool(tilt_B2hw.detach().any()):
         return image_BCHW
+    if not bool(torch.isfinite(tilt_B2hw).all()):
+        raise InputError("the tilt holds NaN or infinite values")
     *_, height, width = image_BCHW.shape
     splat: Tensor = _Splat.apply(image_BCHW, _grid(upsample(tilt_B2hw, stride, height, width)))
     return splat
