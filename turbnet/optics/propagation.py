@@ -11,8 +11,8 @@ through a third plane (`fresnel_two_step`, free spacing), the second form a conv
 spacing). Far away the quadratic phase of the source no longer matters (`fraunhofer`). Each of them is unitary on its
 grid: the sum of |U|^2 spacing^2 is kept to rounding.
 
-Fields are complex tensors (..., N, N), any leading axes, sample (N//2, N//2) on the axis; complex64 or complex128, on any
-device. Lengths in metres. A phase is formed in float64 and rounded once, since it runs to thousands of radians.
+Fields are complex tensors (..., N, N), any leading axes, sample (N//2, N//2) on the axis; complex64 or complex128, on
+any device. Lengths in metres. A phase is formed in float64 and rounded once, since it runs to thousands of radians.
 Source: D. G. Voelz, Computational Fourier Optics (2011), ch. 5; J. D. Schmidt, Numerical Simulation of Optical Wave
 Propagation (2010), ch. 6-8.
 """
@@ -129,7 +129,7 @@ def thin_lens(field: Tensor, wavelength: float, spacing: float, focal_length: fl
 def fresnel_transfer(
     count: int, spacing: float, wavelength: float, distance: float, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """exp(-i pi lambda z f^2) over `frequencies(count, spacing)`, complex128: one axis of the separable transfer function."""
+    """exp(-i pi lambda z f^2) over `frequencies(count, spacing)`, complex128: one axis of the transfer function."""
     f = frequencies(count, spacing, device)
     return torch.polar(torch.ones_like(f), -math.pi * wavelength * distance * f**2)
 
