@@ -38,3 +38,15 @@ def noll_covariance(i: int, j: int) -> float:
 def noll_matrix(modes: Sequence[int]) -> Array:
     """Covariance matrix of the coefficients of `modes` at D/r0 = 1, rad^2; scales with (D/r0)^(5/3)."""
     return np.array([[noll_covariance(i, j) for j in modes] for i in modes])
+
+
+def residual_variance(order: int) -> float:
+    """Mean-square phase left over the pupil at D/r0 = 1 once all modes up to radial order `order` are removed, rad^2.
+
+    1.030 without piston (order 0), 0.134 without tilts (order 1), falling like order^(-5/3).
+    """
+    check_range("radial order", order, 0, 1000)
+    n = np.arange(order + 1, 20001, dtype=np.float64)
+    size = gammaln(n - 5 / 6) - 2 * gammaln(17 / 6) - gammaln(n + 23 / 6)
+    per_order = PREFACTOR * (n + 1) ** 2 * np.exp(size)  # all n + 1 modes of an order have the same variance
+    return float(per_order.sum())

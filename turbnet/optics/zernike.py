@@ -31,24 +31,34 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     return n, m
 
 
-def radial(n: int, m: int, rho: Array) -> Array:
-    """Radial polynomial R_n^m(rho), R_n^m(1) = 1, for 0 <= m <= n with n - m even.
+def jacobi(k: int, alpha: float, beta: float, x: Array) -> Array:
+    """Jacobi polynomial P_k^(alpha, beta)(x), 0 for k < 0, by its three-term recursion.
 
-    By the three-term recursion of the Jacobi polynomials P_k^{(0,m)}(2 rho^2 - 1), k = (n-m)/2: stable at any order,
-    where the factorial sum loses all digits beyond n = 40.
+    Stable on [-1, 1] at any order, where the sum over factorials loses all digits beyond n = 40.
+    """
+    x = np.asarray(x, dtype=np.float64)
+    if k < 0:
+        return np.zeros_like(x)
+    previous, current = np.zeros_like(x), np.ones_like(x)
+    for i in range(k):
+        if i == 0:
+            previous, current = current, 0.5 * ((alpha + beta + 2) * x + alpha - beta)
+            continue
+        s = 2 * i + alpha + beta
+        a = 2 * (i + 1) * (i + alpha + beta + 1) * s
+        b = (s + 1) * (s * (s + 2) * x + alpha**2 - beta**2)
+        c = 2 * (i + alpha) * (i + beta) * (s + 2)
+        previous, current = current, (b * current - c * previous) / a
+    return current
+
+
+def radial(n: int, m: int, rho: Array) -> Array:
+    """Radial polynomial R_n^m(rho) = rho^m P_k^(0,m)(2 rho^2 - 1), k = (n-m)/2, for 0 <= m <= n with n - m even.
+
+    R_n^m(1) = 1.
     """
     rho = np.asarray(rho, dtype=np.float64)
-    k_max = (n - m) // 2
-    x = 2 * rho**2 - 1
-    previous, current = np.ones_like(rho), 0.5 * ((m + 2) * x - m)
-    if k_max == 0:
-        return rho**m
-    for k in range(1, k_max):
-        a = 2 * (k + 1) * (k + m + 1) * (2 * k + m)
-        b = (2 * k + m + 1) * ((2 * k + m) * (2 * k + m + 2) * x - m * m)
-        c = 2 * k * (k + m) * (2 * k + m + 2)
-        previous, current = current, (b * current - c * previous) / a
-    return current * rho**m
+    return rho**m * jacobi((n - m) // 2, 0, m, 2 * rho**2 - 1)
 
 
 def angular(j: int, theta: Array) -> Array:
@@ -63,6 +73,31 @@ def zernike(j: int, rho: Array, theta: Array) -> Array:
     """Z_j at polar points of the unit disk; the polynomial is continued, not cut, beyond rho = 1."""
     n, m = noll_to_nm(j)
     return np.sqrt(n + 1.0) * radial(n, m, rho) * angular(j, theta)
+
+
+def zernike_gradient(j: int, rho: Array, theta: Array) -> tuple[Array, Array]:
+    r"""(dZ_j/dx, dZ_j/dy) at polar points of the unit disk, x = rho cos(theta), y = rho sin(theta).
+
+    .. math::
+        \nabla Z = N\,[P'(s)\,\nabla s\; h_m + P(s)\,\nabla h_m], \qquad s = 2\rho^2 - 1, \quad
+        P' = \tfrac{k+m+1}{2} P_{k-1}^{(1,m+1)}
+
+    with the harmonic polynomial h_m = Re or Im (x + iy)^m, so nothing is divided by rho and the centre is no exception.
+    """
+    rho, theta = np.asarray(rho, dtype=np.float64), np.asarray(theta, dtype=np.float64)
+    n, m = noll_to_nm(j)
+    k, s = (n - m) // 2, 2 * rho**2 - 1
+    norm = np.sqrt(n + 1.0)
+    slope = 4 * norm * rho * 0.5 * (k + m + 1) * jacobi(k - 1, 1, m + 1, s)  # N P'(s) |grad s|
+    along = slope * rho**m * angular(j, theta)
+    grad_x, grad_y = along * np.cos(theta), along * np.sin(theta)
+    if m == 0:
+        return grad_x, grad_y
+    value = np.sqrt(2.0) * norm * m * rho ** (m - 1) * jacobi(k, 0, m, s)
+    cosine, sine = np.cos((m - 1) * theta), np.sin((m - 1) * theta)
+    if j % 2 == 0:
+        return grad_x + value * cosine, grad_y - value * sine
+    return grad_x + value * sine, grad_y + value * cosine
 
 
 def zernike_basis(modes: list[int] | range, rho: Array, theta: Array) -> Array:
