@@ -33,6 +33,7 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from turbnet.atmosphere.profiles import Array
+from turbnet.atmosphere.spectra import phase_spectrum
 from turbnet.errors import check_range
 
 TORUS = 1.5
@@ -126,13 +127,6 @@ class PhaseScreen:
 
     def _normal(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         return torch.randn(shape, dtype=self.dtype, device=generator.device, generator=generator).to(self.device)
-
-
-def phase_spectrum(kappa: Array, r0: float, outer_scale: float = math.inf, inner_scale: float = 0.0) -> Array:
-    """F(kappa), rad^2 m^2, at angular wavenumbers kappa > 0 (rad/m)."""
-    squared = np.asarray(kappa, dtype=np.float64) ** 2
-    tail = np.exp(-squared * (inner_scale / 5.92) ** 2)
-    return np.asarray(0.490 * r0 ** (-5 / 3) * (squared + (2 * np.pi / outer_scale) ** 2) ** (-11 / 6) * tail)
 
 
 def _high_pass(kappa: Array, split: float) -> Array:

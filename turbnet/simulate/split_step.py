@@ -1,0 +1,220 @@
+r"""Split-step propagation of light from many points of a scene through the same turbulent air: the slow reference.
+
+From each object point u a spherical wave runs through thin phase screens phi_l at z_l and still air between them, in a
+frame that follows the straight line from u to the middle of the aperture, x = u z/L + m(z) x'. With V the wave relative
+to the grid's own cone (see `turbnet.simulate.sampling`):
+
+.. math::
+    V_{l+1} = \mathcal{F}^{-1}\{ e^{-i\pi\lambda\tau_l |f|^2 + 2\pi i f\cdot\Delta_l}\,
+              \mathcal{F}\{ A_l\, e^{i\phi_l}\, V_l \} \}
+
+Neighbouring points see overlapping windows of the same screens. A window starts at a whole sample; the fraction of a
+sample left over is the shift Delta_l, put into the transfer function, so that the points stand exactly where they should.
+A_l absorbs what reaches the grid's edge. The wave starts as a band-limited point source and is collimated by dividing by
+what the same source gives in still air. The transfer function is a product of two vectors and the source too.
+
+Source: J. D. Schmidt, Numerical Simulation of Optical Wave Propagation (2010), ch. 9; the windows after J. P. Bos and
+M. C. Roggemann, Opt. Eng. 51, 101705 (2012).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbnet.atmosphere.path import OpticalPath
+from turbnet.atmosphere.profiles import Array
+from turbnet.atmosphere.screens import PhaseScreen
+from turbnet.errors import ParameterError
+from turbnet.optics.propagation import frequencies
+from turbnet.simulate.sampling import Cost, Sampling
+
+LIT_TO_ABSORB = 0.45
+"""From this share of the grid's width on, light nears the edge and the screen's plane absorbs there."""
+
+
+@dataclass(frozen=True)
+class Turbulence:
+    """One or more draws of the air: for each screen, in the order of the light, its phase and e^{i phase}.
+
+    Attributes:
+        phases: (draws, H_l, W_l) each, rad.
+        transmissions: the same, complex.
+    """
+
+    phases: list[Tensor]
+    transmissions: list[Tensor]
+
+
+class SplitStep:
+    """Propagation from object points to the aperture.
+
+    Args:
+        sampling: path, grid and screens.
+        points: object points (y, x) in the scene, (P, 2), m from the axis.
+        outer_scale, inner_scale: of the screens, m; Kolmogorov by default.
+        dtype: torch.float32 or torch.float64.
+        device: where everything runs.
+
+    Raises:
+        ParameterError: points of another shape or not finite.
+    """
+
+    def __init__(
+        self,
+        sampling: Sampling,
+        points: Array | Sequence[tuple[float, float]] = ((0.0, 0.0),),
+        outer_scale: float = math.inf,
+        inner_scale: float = 0.0,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.points = np.asarray(points, dtype=np.float64)
+        if self.points.ndim != 2 or self.points.shape[1] != 2 or not np.isfinite(self.points).all():
+            raise ParameterError(f"points must be finite and of shape (P, 2), not {self.points.shape}")
+        self.sampling, self.dtype, self.device = sampling, dtype, torch.device(device)
+        # Where each point's line of sight crosses each screen, in samples of that screen: (screens, P, 2).
+        crossing = self.points * (sampling.slabs.z / sampling.path.distance / sampling.spacing)[:, None, None]
+        start = np.round(crossing).astype(int)
+        self._remainder = np.concatenate([crossing - start, np.zeros((1, *self.points.shape))])
+        self._lowest = start.min(axis=1)
+        self._window = start - self._lowest[:, None]
+        shapes = self._window.max(axis=1) + sampling.grid
+        self.screens = [
+            PhaseScreen((int(h), int(w)), float(step), float(r0), outer_scale, inner_scale, dtype=dtype, device=device)
+            for (h, w), step, r0 in zip(shapes, sampling.spacing, sampling.slabs.r0, strict=True)
+        ]
+        self._absorber = self._complex(np.outer(_edge(sampling.grid), _edge(sampling.grid)))
+        self._still = self._still_air()
+
+    @property
+    def cost(self) -> Cost:
+        """What propagating every point once takes."""
+        samples = sum(math.prod(screen.shape) for screen in self.screens)
+        size = torch.finfo(self.dtype).bits // 8
+        return Cost(len(self.points), self.sampling.screens, self.sampling.grid, samples, size)
+
+    def draw(self, generator: torch.Generator, count: int = 1) -> Turbulence:
+        """`count` independent draws of the air that all points share."""
+        phases = [screen.draw(count, generator) for screen in self.screens]
+        return Turbulence(phases, [torch.polar(torch.ones_like(phase), phase) for phase in phases])
+
+    def pupil_fields(self, turbulence: Turbulence, points: Sequence[int] = (0,)) -> Tensor:
+        """Collimated field over the aperture's square, (draws, points, n, n), n = `sampling.across`; 1 in still air.
+
+        The grid is that of `turbnet.optics.pupil.pupil_grid(n)`; the aperture itself is not yet applied.
+
+        Args:
+            turbulence: from `draw`.
+            points: which of the points.
+        """
+        draws = len(turbulence.transmissions[0])
+        field = self._propagate(turbulence.transmissions, list(points), draws)
+        middle = self._middle
+        return (field[:, middle, middle] / self._still).unflatten(0, (draws, len(points)))
+
+    def geometric_phase(self, turbulence: Turbulence, points: Sequence[int] = (0,)) -> Tensor:
+        """Sum of the screens' phases along straight rays from each point to the aperture, (draws, points, n, n), rad."""
+        sampling = self.sampling
+        n = sampling.across
+        axis = (np.arange(n) - (n - 1) / 2) * sampling.spacing_aperture
+        total = torch.zeros((), dtype=self.dtype, device=self.device)
+        for l, phase in enumerate(turbulence.phases):
+            nearness = 1 - sampling.slabs.z[l] / sampling.path.distance
+            ray = axis * nearness / sampling.spacing[l] + (sampling.grid - 1) / 2
+            grids = []
+            for p in points:
+                y, x = (ray + self._window[l, p, a] + self._remainder[l, p, a] for a in (0, 1))
+                y, x = 2 * y / (phase.shape[1] - 1) - 1, 2 * x / (phase.shape[2] - 1) - 1
+                grids.append(np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1))
+            grid = torch.from_numpy(np.concatenate(grids)).to(self.device, self.dtype)
+            rays = F.grid_sample(phase[:, None], grid.expand(len(phase), -1, -1, -1), "bilinear", align_corners=True)
+            total = total + rays.view(len(phase), len(points), n, n)
+        return total
+
+    def phase(self, fields: Tensor, geometric: Tensor) -> Tensor:
+        """Phase of `pupil_fields` on the branch nearest to `geometric_phase`, rad: unwrapped where diffraction is weak.
+
+        Of no use where the field has zeros in the aperture (D/r0 well above the Fresnel number's square root).
+        """
+        return geometric + torch.angle(fields * torch.polar(torch.ones_like(geometric), -geometric))
+
+    def _propagate(self, transmissions: list[Tensor], points: list[int], draws: int) -> Tensor:
+        """(draws * points, N, N) at the aperture, draw-major."""
+        grid, lit = self.sampling.grid, self.sampling.lit
+        y, x = (self._source(points, axis).repeat(draws, 1) for axis in (0, 1))
+        field = y[:, :, None] * x[:, None, :]
+        for l, transmission in enumerate(transmissions):
+            for b in range(len(field)):
+                top, left = self._window[l, points[b % len(points)]]
+                field[b] *= transmission[b // len(points), top : top + grid, left : left + grid]
+            if lit[l] > LIT_TO_ABSORB:
+                field *= self._absorber
+            field = torch.fft.fft2(field)
+            field *= self._transfer(l + 1, points, 0).repeat(draws, 1)[:, :, None]
+            field *= self._transfer(l + 1, points, 1).repeat(draws, 1)[:, None, :]
+            field = torch.fft.ifft2(field)
+        return field
+
+    def _transfer(self, step: int, points: list[int], axis: int) -> Tensor:
+        """One axis of the transfer function of step `step` (0 leaves the source), (points, N), shift included."""
+        sampling = self.sampling
+        f = frequencies(sampling.grid, 1.0).numpy()  # cycles per sample
+        rate = sampling.path.wavelength * sampling.reduced_distances[step] / sampling.spacing_aperture**2
+        shift = (self._remainder[step - 1] - self._remainder[step])[points, axis]
+        return self._complex(np.exp(-1j * np.pi * rate * f**2 + 2j * np.pi * shift[:, None] * f))
+
+    def _source(self, points: list[int], axis: int) -> Tensor:
+        """One axis of the band-limited point source's wave at the first screen, (points, N)."""
+        sampling = self.sampling
+        f = frequencies(sampling.grid, 1.0).numpy()
+        rate = sampling.path.wavelength * sampling.reduced_distances[0] / sampling.spacing_aperture**2
+        shift = (sampling.grid - 1) / 2 + self._remainder[0, points, axis]
+        spectrum = np.fft.ifftshift(_band(sampling.grid)) * np.exp(-1j * np.pi * rate * f**2)
+        return self._complex(
+            np.fft.ifft(spectrum * np.exp(-2j * np.pi * shift[:, None] * f)) * math.sqrt(sampling.grid)
+        )
+
+    def _still_air(self) -> Tensor:
+        """What the source gives in the aperture's square without turbulence, (n, n)."""
+        shape = (1, *(2 * [self.sampling.grid]))
+        window, remainder = self._window, self._remainder
+        self._window, self._remainder = np.zeros_like(window), np.zeros_like(remainder)
+        still = [torch.ones(shape, dtype=self.dtype.to_complex(), device=self.device)] * self.sampling.screens
+        field = self._propagate(still, [0], 1)[0, self._middle, self._middle]
+        self._window, self._remainder = window, remainder
+        return field
+
+    @property
+    def _middle(self) -> slice:
+        start = (self.sampling.grid - self.sampling.across) // 2
+        return slice(start, start + self.sampling.across)
+
+    def _complex(self, values: Array) -> Tensor:
+        return torch.from_numpy(np.asarray(values, dtype=np.complex128)).to(self.device, self.dtype.to_complex())
+
+
+def point_grid(path: OpticalPath, rows: int, columns: int, step: float = 1.0) -> Array:
+    """Object points of an image's pixels, row by row, (rows * columns, 2), m; `step` Nyquist pixels apart, centred."""
+    y, x = ((np.arange(count) - (count - 1) / 2) * step * path.pixel for count in (rows, columns))
+    return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _edge(count: int) -> Array:
+    """1 over the middle four fifths, falling to 0 at both ends like a squared cosine."""
+    return _taper(count, 0.8, 1.0)
+
+
+def _band(count: int) -> Array:
+    """Spectrum of the point source, frequency 0 at count // 2: flat over 70 % of the band, 0 from 95 % on."""
+    return _taper(count, 0.7, 0.95)
+
+
+def _taper(count: int, flat: float, end: float) -> Array:
+    position = np.abs(2 * (np.arange(count) - count // 2) / count)
+    return np.asarray(np.cos(np.pi / 2 * np.clip((position - flat) / (end - flat), 0, 1)) ** 2)
