@@ -46,7 +46,7 @@ def slabs(path: OpticalPath, count: int) -> Slabs:
     thickness = path.distance / count
     z, weight = path.quadrature()
     slab = np.minimum((z / thickness).astype(int), count - 1)
-    cn2_dz = np.bincount(slab, weight, count)
+    cn2_dz = np.bincount(slab, weight, count).astype(np.float64)
     toward = np.bincount(slab, weight * (1 - z / path.distance) ** (5 / 3), count)
     filled = np.maximum(cn2_dz, np.finfo(np.float64).tiny)
     middle = (np.arange(count) + 0.5) * thickness

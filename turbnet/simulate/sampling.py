@@ -7,14 +7,14 @@ The wave runs on N x N samples whose spacing changes linearly from the scene to 
     \delta_0 = \frac{sD}{N}, \qquad \delta_L = \frac{\lambda L}{sD}
 
 In the aperture the grid is s diameters wide; in the scene its spacing lets a band-limited point source light just that
-width. In coordinates x / m(z), m = delta(z) / delta_0, with the curvature of the grid's own cone taken off, the wave obeys
-the plain Fresnel equation over the reduced distance
+width. In coordinates x / m(z), m = delta(z) / delta_0, with the curvature of the grid's own cone taken off, the wave
+obeys the plain Fresnel equation over the reduced distance
 
 .. math:: \tau_{ab} = (z_a - z_b) / (m_a m_b), \qquad \lambda\, \tau_{L0} = N \delta_0^2
 
 whose last equality is critical sampling of the whole way, for any geometry; each step stays below it. Source: D. G.
-Voelz, Computational Fourier Optics (2011), ch. 5; J. D. Schmidt, Numerical Simulation of Optical Wave Propagation (2010),
-ch. 8-9; J. M. Martin and S. M. Flatté, Appl. Opt. 27, 2111 (1988) for the strength of one screen.
+Voelz, Computational Fourier Optics (2011), ch. 5; J. D. Schmidt, Numerical Simulation of Optical Wave Propagation
+(2010), ch. 8-9; J. M. Martin and S. M. Flatté, Appl. Opt. 27, 2111 (1988) for the strength of one screen.
 """
 
 from dataclasses import dataclass
@@ -59,30 +59,30 @@ class Sampling:
         across = self.grid / self.extent
         if across != int(across) or (self.grid - int(across)) % 2:
             raise ParameterError(
-                f"grid = {self.grid} samples over extent = {self.extent:g} diameters puts {across:g} samples across the "
-                "aperture; they must be whole, and even if the grid is even"
+                f"grid = {self.grid} samples over extent = {self.extent:g} diameters puts {across:g} samples across "
+                "the aperture; they must be whole, and even if the grid is even"
             )
         self._check_turbulence()
 
     def _check_turbulence(self) -> None:
-        path, finest = self.path, min(self.path.r0, float(np.min(self.slabs.r0)))
+        path, finest = self.path, float(np.min(self.slabs.r0))
         coarse = SAMPLES_PER_R0 * self.spacing_aperture / path.r0
         if coarse > 1:
             raise ParameterError(
-                f"spacing in the aperture = {self.spacing_aperture:.3g} m is too coarse for r0 = {path.r0:.3g} m, which "
-                f"must span {SAMPLES_PER_R0} samples; use grid >= {int(np.ceil(self.grid * coarse))}"
+                f"spacing in the aperture = {self.spacing_aperture:.3g} m is too coarse for r0 = {path.r0:.3g} m, "
+                f"which must span {SAMPLES_PER_R0} samples; use grid >= {int(np.ceil(self.grid * coarse))}"
             )
         coarse = SAMPLES_PER_R0 * float(np.max(self.spacing / self.slabs.r0))
         if coarse > 1:
             raise ParameterError(
-                f"a screen of r0 = {finest:.3g} m is sampled too coarsely: {SAMPLES_PER_R0} samples must span it; use more "
-                f"screens, or grid and extent >= {coarse:.3g} times as large"
+                f"a screen of r0 = {finest:.3g} m is sampled too coarsely: {SAMPLES_PER_R0} samples must span it; use "
+                f"more screens, or grid and extent >= {coarse:.3g} times as large"
             )
         spread = 2 * path.wavelength * path.distance / path.r0
         if spread > (self.extent - 1) * path.aperture:
             raise ParameterError(
-                f"light scattered by r0 = {path.r0:.3g} m spreads {spread:.3g} m in the aperture's plane and would wrap "
-                f"around the grid into the aperture; use extent >= {np.ceil(1 + spread / path.aperture):g}"
+                f"light scattered by r0 = {path.r0:.3g} m spreads {spread:.3g} m in the aperture's plane and would "
+                f"wrap around the grid into the aperture; use extent >= {np.ceil(1 + spread / path.aperture):g}"
             )
         rytov = float(self.slab_rytov.max())
         if rytov > SLAB_RYTOV:

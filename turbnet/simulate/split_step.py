@@ -8,10 +8,10 @@ to the grid's own cone (see `turbnet.simulate.sampling`):
     V_{l+1} = \mathcal{F}^{-1}\{ e^{-i\pi\lambda\tau_l |f|^2 + 2\pi i f\cdot\Delta_l}\,
               \mathcal{F}\{ A_l\, e^{i\phi_l}\, V_l \} \}
 
-Neighbouring points see overlapping windows of the same screens. A window starts at a whole sample; the fraction of a
-sample left over is the shift Delta_l, put into the transfer function, so that the points stand exactly where they should.
-A_l absorbs what reaches the grid's edge. The wave starts as a band-limited point source and is collimated by dividing by
-what the same source gives in still air. The transfer function is a product of two vectors and the source too.
+Neighbouring points see overlapping windows of the same screens. A window starts at a whole sample; the part of a sample
+left over is the shift Delta_l, put into the transfer function, so that the points stand exactly where they should. A_l
+absorbs what reaches the grid's edge. The wave starts as a band-limited point source and is collimated by dividing by
+what the same source gives in still air. Source, transfer function and absorber are each a product of two vectors.
 
 Source: J. D. Schmidt, Numerical Simulation of Optical Wave Propagation (2010), ch. 9; the windows after J. P. Bos and
 M. C. Roggemann, Opt. Eng. 51, 101705 (2012).
@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from turbnet.atmosphere.path import OpticalPath
@@ -81,16 +82,18 @@ class SplitStep:
         # Where each point's line of sight crosses each screen, in samples of that screen: (screens, P, 2).
         crossing = self.points * (sampling.slabs.z / sampling.path.distance / sampling.spacing)[:, None, None]
         start = np.round(crossing).astype(int)
-        self._remainder = np.concatenate([crossing - start, np.zeros((1, *self.points.shape))])
-        self._lowest = start.min(axis=1)
-        self._window = start - self._lowest[:, None]
+        remainder = np.concatenate([crossing - start, np.zeros((1, *self.points.shape))])
+        self._window = start - start.min(axis=1, keepdims=True)
+        self._centre = self._window + remainder[:-1] + (sampling.grid - 1) / 2
         shapes = self._window.max(axis=1) + sampling.grid
         self.screens = [
             PhaseScreen((int(h), int(w)), float(step), float(r0), outer_scale, inner_scale, dtype=dtype, device=device)
             for (h, w), step, r0 in zip(shapes, sampling.spacing, sampling.slabs.r0, strict=True)
         ]
-        self._absorber = self._complex(np.outer(_edge(sampling.grid), _edge(sampling.grid)))
-        self._still = self._still_air()
+        self._axes = [_Axis(sampling, remainder[:, :, a], dtype.to_complex(), self.device) for a in (0, 1)]
+        edge, still = _edge(sampling.grid), _still_air(sampling)[self._middle]
+        self._absorber = torch.from_numpy(np.outer(edge, edge)).to(self.device, dtype.to_complex())
+        self._still = torch.from_numpy(np.outer(still, still)).to(self.device, dtype.to_complex())
 
     @property
     def cost(self) -> Cost:
@@ -119,20 +122,19 @@ class SplitStep:
         return (field[:, middle, middle] / self._still).unflatten(0, (draws, len(points)))
 
     def geometric_phase(self, turbulence: Turbulence, points: Sequence[int] = (0,)) -> Tensor:
-        """Sum of the screens' phases along straight rays from each point to the aperture, (draws, points, n, n), rad."""
+        """Sum of the screens' phases along straight rays from each point, (draws, points, n, n), rad."""
         sampling = self.sampling
         n = sampling.across
         axis = (np.arange(n) - (n - 1) / 2) * sampling.spacing_aperture
         total = torch.zeros((), dtype=self.dtype, device=self.device)
-        for l, phase in enumerate(turbulence.phases):
-            nearness = 1 - sampling.slabs.z[l] / sampling.path.distance
-            ray = axis * nearness / sampling.spacing[l] + (sampling.grid - 1) / 2
-            grids = []
-            for p in points:
-                y, x = (ray + self._window[l, p, a] + self._remainder[l, p, a] for a in (0, 1))
-                y, x = 2 * y / (phase.shape[1] - 1) - 1, 2 * x / (phase.shape[2] - 1) - 1
-                grids.append(np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1))
-            grid = torch.from_numpy(np.concatenate(grids)).to(self.device, self.dtype)
+        for layer, phase in enumerate(turbulence.phases):
+            nearness = 1 - sampling.slabs.z[layer] / sampling.path.distance
+            # Where the rays cross the screen, in the units of grid_sample: -1 and 1 at the outermost samples.
+            centre = self._centre[layer, list(points)]
+            ray = axis * nearness / sampling.spacing[layer]
+            y, x = (2 * (centre[:, a, None] + ray) / (phase.shape[1 + a] - 1) - 1 for a in (0, 1))
+            crossings = np.stack(np.broadcast_arrays(x[:, None, :], y[:, :, None]), axis=-1).reshape(1, -1, n, 2)
+            grid = torch.from_numpy(crossings).to(self.device, self.dtype)
             rays = F.grid_sample(phase[:, None], grid.expand(len(phase), -1, -1, -1), "bilinear", align_corners=True)
             total = total + rays.view(len(phase), len(points), n, n)
         return total
@@ -147,47 +149,18 @@ class SplitStep:
     def _propagate(self, transmissions: list[Tensor], points: list[int], draws: int) -> Tensor:
         """(draws * points, N, N) at the aperture, draw-major."""
         grid, lit = self.sampling.grid, self.sampling.lit
-        y, x = (self._source(points, axis).repeat(draws, 1) for axis in (0, 1))
-        field = y[:, :, None] * x[:, None, :]
-        for l, transmission in enumerate(transmissions):
+        (source_y, step_y), (source_x, step_x) = (axis.select(points, draws) for axis in self._axes)
+        field = source_y[:, :, None] * source_x[:, None, :]
+        for layer, transmission in enumerate(transmissions):
             for b in range(len(field)):
-                top, left = self._window[l, points[b % len(points)]]
+                top, left = self._window[layer, points[b % len(points)]]
                 field[b] *= transmission[b // len(points), top : top + grid, left : left + grid]
-            if lit[l] > LIT_TO_ABSORB:
+            if lit[layer] > LIT_TO_ABSORB:
                 field *= self._absorber
             field = torch.fft.fft2(field)
-            field *= self._transfer(l + 1, points, 0).repeat(draws, 1)[:, :, None]
-            field *= self._transfer(l + 1, points, 1).repeat(draws, 1)[:, None, :]
+            field *= step_y[layer, :, :, None]
+            field *= step_x[layer, :, None, :]
             field = torch.fft.ifft2(field)
-        return field
-
-    def _transfer(self, step: int, points: list[int], axis: int) -> Tensor:
-        """One axis of the transfer function of step `step` (0 leaves the source), (points, N), shift included."""
-        sampling = self.sampling
-        f = frequencies(sampling.grid, 1.0).numpy()  # cycles per sample
-        rate = sampling.path.wavelength * sampling.reduced_distances[step] / sampling.spacing_aperture**2
-        shift = (self._remainder[step - 1] - self._remainder[step])[points, axis]
-        return self._complex(np.exp(-1j * np.pi * rate * f**2 + 2j * np.pi * shift[:, None] * f))
-
-    def _source(self, points: list[int], axis: int) -> Tensor:
-        """One axis of the band-limited point source's wave at the first screen, (points, N)."""
-        sampling = self.sampling
-        f = frequencies(sampling.grid, 1.0).numpy()
-        rate = sampling.path.wavelength * sampling.reduced_distances[0] / sampling.spacing_aperture**2
-        shift = (sampling.grid - 1) / 2 + self._remainder[0, points, axis]
-        spectrum = np.fft.ifftshift(_band(sampling.grid)) * np.exp(-1j * np.pi * rate * f**2)
-        return self._complex(
-            np.fft.ifft(spectrum * np.exp(-2j * np.pi * shift[:, None] * f)) * math.sqrt(sampling.grid)
-        )
-
-    def _still_air(self) -> Tensor:
-        """What the source gives in the aperture's square without turbulence, (n, n)."""
-        shape = (1, *(2 * [self.sampling.grid]))
-        window, remainder = self._window, self._remainder
-        self._window, self._remainder = np.zeros_like(window), np.zeros_like(remainder)
-        still = [torch.ones(shape, dtype=self.dtype.to_complex(), device=self.device)] * self.sampling.screens
-        field = self._propagate(still, [0], 1)[0, self._middle, self._middle]
-        self._window, self._remainder = window, remainder
         return field
 
     @property
@@ -195,14 +168,57 @@ class SplitStep:
         start = (self.sampling.grid - self.sampling.across) // 2
         return slice(start, start + self.sampling.across)
 
-    def _complex(self, values: Array) -> Tensor:
-        return torch.from_numpy(np.asarray(values, dtype=np.complex128)).to(self.device, self.dtype.to_complex())
-
 
 def point_grid(path: OpticalPath, rows: int, columns: int, step: float = 1.0) -> Array:
     """Object points of an image's pixels, row by row, (rows * columns, 2), m; `step` Nyquist pixels apart, centred."""
     y, x = ((np.arange(count) - (count - 1) / 2) * step * path.pixel for count in (rows, columns))
     return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+class _Axis:
+    """One axis of the separable source and transfer functions, for every distinct coordinate of the points.
+
+    Args:
+        sampling: of the propagation.
+        remainder: part of a sample between each point's line of sight and its window, (screens + 1, P).
+    """
+
+    def __init__(self, sampling: Sampling, remainder: Array, dtype: torch.dtype, device: torch.device) -> None:
+        distinct, self._which = np.unique(remainder, axis=1, return_inverse=True)
+        f = frequencies(sampling.grid, 1.0).numpy()  # cycles per sample
+        shift = distinct[:-1] - distinct[1:]
+        steps = _transfers(sampling)[1:, None] * np.exp(2j * np.pi * shift[:, :, None] * f)
+        source = _source(sampling, distinct[0])
+        self._source, self._steps = (torch.from_numpy(a).to(device, dtype) for a in (source, steps))
+
+    def select(self, points: list[int], repeats: int) -> tuple[Tensor, Tensor]:
+        """Source (B, N) and transfer functions (screens, B, N) of the points, the whole repeated."""
+        which = torch.from_numpy(np.tile(self._which[points], repeats)).to(self._source.device)
+        return self._source[which], self._steps[:, which]
+
+
+def _transfers(sampling: Sampling) -> NDArray[np.complex128]:
+    """exp(-i pi lambda tau f^2) of each step, (screens + 1, N)."""
+    f = frequencies(sampling.grid, 1.0).numpy()
+    rate = sampling.path.wavelength * sampling.reduced_distances / sampling.spacing_aperture**2
+    return np.asarray(np.exp(-1j * np.pi * rate[:, None] * f**2))
+
+
+def _source(sampling: Sampling, remainder: Array) -> NDArray[np.complex128]:
+    """The band-limited point source's wave at the first screen, along one axis, (len(remainder), N)."""
+    f = frequencies(sampling.grid, 1.0).numpy()
+    middle = (sampling.grid - 1) / 2 + remainder
+    spectrum = np.fft.ifftshift(_band(sampling.grid)) * _transfers(sampling)[0]
+    wave = np.fft.ifft(spectrum * np.exp(-2j * np.pi * middle[:, None] * f))
+    return np.asarray(wave * math.sqrt(sampling.grid))
+
+
+def _still_air(sampling: Sampling) -> NDArray[np.complex128]:
+    """What the source gives at the aperture without turbulence, along one axis, (N,)."""
+    wave = _source(sampling, np.zeros(1))[0]
+    for lit, transfer in zip(sampling.lit, _transfers(sampling)[1:], strict=True):
+        wave = np.fft.ifft(np.fft.fft(wave * _edge(sampling.grid) if lit > LIT_TO_ABSORB else wave) * transfer)
+    return np.asarray(wave)
 
 
 def _edge(count: int) -> Array:
