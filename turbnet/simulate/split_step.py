@@ -79,6 +79,7 @@ class SplitStep:
         if self.points.ndim != 2 or self.points.shape[1] != 2 or not np.isfinite(self.points).all():
             raise ParameterError(f"points must be finite and of shape (P, 2), not {self.points.shape}")
         self.sampling, self.dtype, self.device = sampling, dtype, torch.device(device)
+        self.scales = outer_scale, inner_scale
         # Where each point's line of sight crosses each screen, in samples of that screen: (screens, P, 2).
         crossing = self.points * (sampling.slabs.z / sampling.path.distance / sampling.spacing)[:, None, None]
         start = np.round(crossing).astype(int)
