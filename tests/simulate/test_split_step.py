@@ -28,7 +28,7 @@ def air_of(split_step: SplitStep, layer: int, phase) -> Turbulence:
     spacing = split_step.sampling.spacing[layer]
     y, x = ((torch.arange(n, dtype=split_step.dtype) - (n - 1) / 2) * spacing for n in phases[layer].shape[1:])
     phases[layer] = (phase(y[:, None], x) + torch.zeros_like(phases[layer][0]))[None]
-    return Turbulence(phases, [torch.polar(torch.ones_like(p), p) for p in phases])
+    return Turbulence.of(phases)
 
 
 def test_still_air_gives_a_flat_field_and_the_airy_pattern():

@@ -114,7 +114,7 @@ class PhaseScreen:
 
         The exact expectation of what `draw` makes: a sum over its discrete waves.
         """
-        rows, columns = np.asarray(rows), np.asarray(columns)
+        rows, columns = np.asarray(rows).astype(int), np.asarray(columns).astype(int)
         covariance = np.fft.irfft2(self._weights, s=self._torus) * self._torus[0] * self._torus[1]
         high = 2 * (covariance[0, 0] - covariance[rows % self._torus[0], columns % self._torus[1]])
         dy, dx = rows * self.spacing, columns * self.spacing

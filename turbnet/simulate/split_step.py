@@ -50,6 +50,11 @@ class Turbulence:
     phases: list[Tensor]
     transmissions: list[Tensor]
 
+    @classmethod
+    def of(cls, phases: list[Tensor]) -> "Turbulence":
+        """The air whose screens have these phases."""
+        return cls(phases, [torch.polar(torch.ones_like(phase), phase) for phase in phases])
+
 
 class SplitStep:
     """Propagation from object points to the aperture.
@@ -105,8 +110,7 @@ class SplitStep:
 
     def draw(self, generator: torch.Generator, count: int = 1) -> Turbulence:
         """`count` independent draws of the air that all points share."""
-        phases = [screen.draw(count, generator) for screen in self.screens]
-        return Turbulence(phases, [torch.polar(torch.ones_like(phase), phase) for phase in phases])
+        return Turbulence.of([screen.draw(count, generator) for screen in self.screens])
 
     def pupil_fields(self, turbulence: Turbulence, points: Sequence[int] = (0,)) -> Tensor:
         """Collimated field over the aperture's square, (draws, points, n, n), n = `sampling.across`; 1 in still air.
