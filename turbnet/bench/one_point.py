@@ -93,8 +93,8 @@ class OnePoint:
         return float(self.sampling.path.aperture / found)
 
 
-def measure(draws: int, seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Panel]]:
-    """All rows and figures of the family. `track` yields the batches, so that a caller can show progress."""
+def measure(seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Panel]]:
+    """All rows and figures of the family. `track` yields once for each batch of draws, so that a caller can show progress."""
     run = OnePoint()
     run.run(track, seed)
     parts = [_noll(run), _long_exposure(run), _short_exposure(run), _lucky(run)]

@@ -1,0 +1,110 @@
+"""Split-step propagation from several points through the same air: tilts, isoplanatic angle, log-amplitude.
+
+The path is the default one (7 km), where neighbouring pixels see different air. Z-tilt is E[alpha(u) alpha(u')], D-tilt
+E[(alpha(u) - alpha(u'))^2], alpha = 2 lambda a / (pi D), along the separation and across it.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from turbnet.atmosphere.covariance import zernike_covariance
+from turbnet.atmosphere.path import OpticalPath
+from turbnet.atmosphere.profiles import Array
+from turbnet.bench.measurement import Measurement, Panel, Series, mean_and_error
+from turbnet.simulate.sampling import Sampling
+from turbnet.simulate.split_step import SplitStep
+from turbnet.simulate.wavefront import Aperture
+
+STRENGTH = 1.5
+SEPARATIONS = np.array([1, 2, 4, 8, 16, 32, 64])
+BATCH = 4
+
+
+def measure(seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Panel]]:
+    """All rows and figures of the family. `track` yields once for each batch of draws, so that a caller can show progress."""
+    path = OpticalPath.from_d_over_r0(STRENGTH)
+    columns = np.concatenate([[0], SEPARATIONS]) * path.pixel
+    split_step = SplitStep(Sampling(path), np.stack([0 * columns, columns], axis=1))
+    aperture = Aperture(split_step.sampling.across, 15)
+    generator = torch.Generator().manual_seed(seed)
+    points = range(len(columns))
+    tilts, overlaps, logs = [], [], []
+    for _ in track:
+        air = split_step.draw(generator, BATCH)
+        field = split_step.pupil_fields(air, points)
+        phase = split_step.phase(field, split_step.geometric_phase(air, points))
+        tilts.append(aperture.coefficients(phase)[..., 1:3])
+        inner = field[..., aperture.inside]
+        overlaps.append((inner[:, 1:] * inner[:, :1].conj()).mean(-1).real)
+        amplitude = inner[:, 0].abs().log()
+        logs.append(torch.stack([amplitude.mean(-1), amplitude.square().mean(-1)], dim=-1))
+    measurements, panels = _tilts(path, torch.cat(tilts).double().numpy())
+    measurements.append(_isoplanatic_angle(path, torch.cat(overlaps).double().numpy()))
+    measurements.append(_log_amplitude(path, torch.cat(logs).double().numpy()))
+    return measurements, panels
+
+
+def _tilts(path: OpticalPath, tilts: Array) -> tuple[list[Measurement], list[Panel]]:
+    """tilts: (draws, points, 2)."""
+    micro = 1e12 * (2 * path.wavelength / (np.pi * path.aperture)) ** 2  # (microradian / rad of coefficient)^2
+    measurements, z_series, d_series = [], [], []
+    fine = np.geomspace(0.5, 100, 60)
+    for axis, (j, direction) in enumerate([(2, "along"), (3, "across")]):
+
+        def covariance(separation: Array | float, j: int = j) -> Array:
+            return micro * zernike_covariance(path, j, j, np.asarray(separation) * path.pixel)
+
+        products = micro * tilts[:, 1:, axis] * tilts[:, :1, axis]
+        differences = micro * (tilts[:, 1:, axis] - tilts[:, :1, axis]) ** 2
+        variance, variance_error = mean_and_error(micro * (tilts[:, :, axis] ** 2).mean(axis=1))
+        name = f"Z-tilt {direction} at 0 pixels"
+        measurements.append(
+            Measurement(name, float(covariance(0.0)), float(variance), float(variance_error), unit="urad^2")
+        )
+        z, z_error = mean_and_error(products)
+        d, d_error = mean_and_error(differences)
+        z_theory = covariance(SEPARATIONS)
+        d_theory = 2 * (covariance(0.0) - z_theory)
+        for i in (0, 2, 4, 6):
+            at = f"{direction} at {SEPARATIONS[i]} pixels"
+            measurements.append(Measurement(f"Z-tilt {at}", z_theory[i], z[i], z_error[i], unit="urad^2"))
+            measurements.append(Measurement(f"D-tilt {at}", d_theory[i], d[i], d_error[i], unit="urad^2"))
+        z_series += [
+            Series(f"theory, {direction}", fine, covariance(fine)),
+            Series("split-step", SEPARATIONS, z, z_error),
+        ]
+        d_series += [
+            Series(f"theory, {direction}", fine, 2 * (covariance(0.0) - covariance(fine))),
+            Series("split-step", SEPARATIONS, d, d_error),
+        ]
+    title, x_label = f"L = {path.distance / 1e3:g} km, D/r0 = {STRENGTH:g}", "separation (Nyquist pixels)"
+    return measurements, [
+        Panel("z-tilt", f"Z-tilt, {title}", x_label, "covariance ($\\mu$rad$^2$)", z_series, ("log", "linear")),
+        Panel("d-tilt", f"D-tilt, {title}", x_label, "structure function ($\\mu$rad$^2$)", d_series, ("log", "log")),
+    ]
+
+
+def _isoplanatic_angle(path: OpticalPath, overlaps: Array) -> Measurement:
+    """theta0 from the coherence of two points' waves, E[U U'*] = exp(-(theta/theta0)^(5/3) / 2), any strength."""
+    angle = SEPARATIONS * path.pixel / path.distance
+
+    def fit(samples: Array) -> float:
+        coherence = samples.mean(axis=0)
+        used = (coherence > 0.1) & (coherence < 0.9)
+        return float(np.mean(angle[used] * (-2 * np.log(coherence[used])) ** (-3 / 5)))
+
+    groups = np.array_split(np.arange(len(overlaps)), min(10, len(overlaps)))
+    left_out = [fit(np.delete(overlaps, group, axis=0)) for group in groups]
+    error = float(np.std(left_out) * np.sqrt(len(groups) - 1))
+    name = f"theta0 from the coherence of two points, D/r0 = {STRENGTH:g}"
+    return Measurement(name, 1e6 * path.theta0, 1e6 * fit(overlaps), 1e6 * error, unit="urad")
+
+
+def _log_amplitude(path: OpticalPath, logs: Array) -> Measurement:
+    """Variance of ln|U| against Rytov's for a spherical wave; a first-order theory, hence only compared."""
+    mean = logs[:, 0].mean()
+    variance, error = mean_and_error(logs[:, 1] - 2 * mean * logs[:, 0] + mean**2)
+    name = f"log-amplitude variance, D/r0 = {STRENGTH:g}"
+    return Measurement(name, path.rytov_spherical / 4, float(variance), float(error), None)
