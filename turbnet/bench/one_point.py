@@ -12,6 +12,8 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from turbnet.atmosphere.covariance import zernike_covariance
+from turbnet.atmosphere.diffraction import diffracted_covariance
 from turbnet.atmosphere.exposure import long_exposure_factor, short_exposure_otf
 from turbnet.atmosphere.lucky import lucky_karhunen_loeve, lucky_probability
 from turbnet.atmosphere.noll import noll_covariance
@@ -29,6 +31,7 @@ MODES = range(2, 16)
 DISTANCE = 500.0
 BATCH = 8
 OTF_FLOOR = 0.02
+Samples = dict[float, list[Tensor]]
 
 
 class OnePoint:
@@ -42,16 +45,18 @@ class OnePoint:
         self._lattice, self._bins_exact = _lattice(self.points), _radial_bins(self.points)
         self._bins = torch.from_numpy(self._bins_exact).float()
         self._still = tilt_free_otf(self.points, 0.0)
-        empty: dict[float, list[Tensor]] = {strength: [] for strength in STRENGTHS}
-        self.coefficients, self.residuals, self.long, self.short = (
-            {k: list(v) for k, v in empty.items()} for _ in "1234"
-        )
+        self.rays: list[Tensor] = []
+        self.coefficients: Samples = {strength: [] for strength in STRENGTHS}
+        self.residuals: Samples = {strength: [] for strength in STRENGTHS}
+        self.long: Samples = {strength: [] for strength in STRENGTHS}
+        self.short: Samples = {strength: [] for strength in STRENGTHS}
 
     def run(self, batches: Iterable[int], seed: int) -> None:
         """Propagate BATCH draws for each item of `batches`, at every strength."""
         generator = torch.Generator().manual_seed(seed)
         for _ in batches:
             air = self.split_step.draw(generator, BATCH)
+            self.rays.append(self.aperture.coefficients(self.split_step.geometric_phase(air)[:, 0])[:, 1:15])
             for strength in STRENGTHS:
                 scale = (strength / max(STRENGTHS)) ** (5 / 6)
                 self._add(strength, Turbulence.of([phase * scale for phase in air.phases]))
@@ -94,11 +99,11 @@ class OnePoint:
 
 
 def measure(seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Panel]]:
-    """All rows and figures of the family. `track` yields once for each batch of draws, so that a caller can show progress."""
+    """All rows and figures of the family. `track` yields once for each batch of draws, and may show progress."""
     run = OnePoint()
     run.run(track, seed)
-    parts = [_noll(run), _long_exposure(run), _short_exposure(run), _lucky(run)]
-    return [m for part, _ in parts for m in part], [panel for _, panel in parts]
+    parts = [_noll(run), _diffraction(run), _long_exposure(run), _short_exposure(run), _lucky(run)]
+    return [m for part, _ in parts for m in part], [panel for _, panel in parts if panel is not None]
 
 
 def _noll(run: OnePoint) -> tuple[list[Measurement], Panel]:
@@ -119,6 +124,21 @@ def _noll(run: OnePoint) -> tuple[list[Measurement], Panel]:
             series.append(Series(f"split-step, D/r0 = {strength:g}", modes + shift, variance / scale, error / scale))
     title = "Variance of Zernike coefficients over $(D/r_0)^{5/3}$"
     return measurements, Panel("noll-variances", title, "Noll index j", "variance (rad$^2$)", series, ("linear", "log"))
+
+
+def _diffraction(run: OnePoint) -> tuple[list[Measurement], None]:
+    """Variance of the wave's coefficients over that of straight rays through the same screens: most luck cancels."""
+    measurements = []
+    rays = _numpy(run.rays) ** 2
+    for strength in (1.0, 3.0, 5.0):
+        scale = (strength / max(STRENGTHS)) ** (5 / 3)
+        path = OpticalPath.from_d_over_r0(strength, distance=DISTANCE)
+        ratio, error = ratio_and_error(_numpy(run.coefficients[strength]) ** 2, rays * scale)
+        for j in (2, 4, 7, 11, 14):
+            theory = float(diffracted_covariance(path, j, j, 0.0) / zernike_covariance(path, j, j, 0.0))
+            name = f"variance of the wave over that of rays, j = {j}, D/r0 = {strength:g}"
+            measurements.append(Measurement(name, theory, ratio[j - 2], error[j - 2], 0.01))
+    return measurements, None
 
 
 def _long_exposure(run: OnePoint) -> tuple[list[Measurement], Panel]:

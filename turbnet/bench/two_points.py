@@ -1,7 +1,8 @@
 """Split-step propagation from several points through the same air: tilts, isoplanatic angle, log-amplitude.
 
 The path is the default one (7 km), where neighbouring pixels see different air. Z-tilt is E[alpha(u) alpha(u')], D-tilt
-E[(alpha(u) - alpha(u'))^2], alpha = 2 lambda a / (pi D), along the separation and across it.
+E[(alpha(u) - alpha(u'))^2], alpha = 2 lambda a / (pi D), along the separation and across it. The Fresnel number is 11
+only, so the theory is the one with diffraction; the near-field one stands beside it.
 """
 
 from collections.abc import Iterable
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from turbnet.atmosphere.covariance import zernike_covariance
+from turbnet.atmosphere.diffraction import diffracted_covariance
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Array
 from turbnet.bench.measurement import Measurement, Panel, Series, mean_and_error
@@ -23,7 +25,7 @@ BATCH = 4
 
 
 def measure(seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Panel]]:
-    """All rows and figures of the family. `track` yields once for each batch of draws, so that a caller can show progress."""
+    """All rows and figures of the family. `track` yields once for each batch of draws, and may show progress."""
     path = OpticalPath.from_d_over_r0(STRENGTH)
     columns = np.concatenate([[0], SEPARATIONS]) * path.pixel
     split_step = SplitStep(Sampling(path), np.stack([0 * columns, columns], axis=1))
@@ -47,37 +49,37 @@ def measure(seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Pa
 
 
 def _tilts(path: OpticalPath, tilts: Array) -> tuple[list[Measurement], list[Panel]]:
-    """tilts: (draws, points, 2)."""
+    """tilts: (draws, points, 2). Standard errors are those of products of Gaussian variables."""
     micro = 1e12 * (2 * path.wavelength / (np.pi * path.aperture)) ** 2  # (microradian / rad of coefficient)^2
     measurements, z_series, d_series = [], [], []
-    fine = np.geomspace(0.5, 100, 60)
+    fine = np.concatenate([[0.0], np.geomspace(0.5, 100, 60)])
+    every = np.concatenate([[0], SEPARATIONS])
     for axis, (j, direction) in enumerate([(2, "along"), (3, "across")]):
-
-        def covariance(separation: Array | float, j: int = j) -> Array:
-            return micro * zernike_covariance(path, j, j, np.asarray(separation) * path.pixel)
-
-        products = micro * tilts[:, 1:, axis] * tilts[:, :1, axis]
-        differences = micro * (tilts[:, 1:, axis] - tilts[:, :1, axis]) ** 2
-        variance, variance_error = mean_and_error(micro * (tilts[:, :, axis] ** 2).mean(axis=1))
-        name = f"Z-tilt {direction} at 0 pixels"
-        measurements.append(
-            Measurement(name, float(covariance(0.0)), float(variance), float(variance_error), unit="urad^2")
-        )
-        z, z_error = mean_and_error(products)
-        d, d_error = mean_and_error(differences)
-        z_theory = covariance(SEPARATIONS)
-        d_theory = 2 * (covariance(0.0) - z_theory)
-        for i in (0, 2, 4, 6):
-            at = f"{direction} at {SEPARATIONS[i]} pixels"
-            measurements.append(Measurement(f"Z-tilt {at}", z_theory[i], z[i], z_error[i], unit="urad^2"))
-            measurements.append(Measurement(f"D-tilt {at}", d_theory[i], d[i], d_error[i], unit="urad^2"))
+        theory, curve = (micro * diffracted_covariance(path, j, j, s * path.pixel) for s in (every, fine))
+        near = micro * zernike_covariance(path, j, j, fine * path.pixel)
+        z = micro * (tilts[:, :, axis] * tilts[:, :1, axis]).mean(axis=0)
+        d = micro * ((tilts[:, :, axis] - tilts[:, :1, axis]) ** 2).mean(axis=0)
+        d_theory = 2 * (theory[0] - theory)
+        z_error = np.sqrt((theory[0] ** 2 + theory**2) / len(tilts))
+        d_error = d_theory * np.sqrt(2 / len(tilts))
+        for i in (0, 1, 3, 5, 7):
+            at = f"{direction} the separation, {every[i]} pixels"
+            measurements.append(Measurement(f"Z-tilt {at}", theory[i], z[i], z_error[i], unit="urad^2"))
+            if i:
+                measurements.append(Measurement(f"D-tilt {at}", d_theory[i], d[i], d_error[i], unit="urad^2"))
+        for i in (1, 3):
+            geometric = 2 * micro * (zernike_covariance(path, j, j, np.array([0, every[i]]) * path.pixel) @ [1, -1])
+            name = f"D-tilt {direction} the separation, {every[i]} pixels, near-field theory"
+            measurements.append(Measurement(name, float(geometric), d[i], d_error[i], None, "urad^2"))
+        bars = slice(1, None)
         z_series += [
-            Series(f"theory, {direction}", fine, covariance(fine)),
-            Series("split-step", SEPARATIONS, z, z_error),
+            Series(f"theory, {direction}", fine[bars], curve[bars]),
+            Series("split-step", every[bars], z[bars], z_error[bars]),
         ]
         d_series += [
-            Series(f"theory, {direction}", fine, 2 * (covariance(0.0) - covariance(fine))),
-            Series("split-step", SEPARATIONS, d, d_error),
+            Series(f"theory, {direction}", fine[bars], 2 * (curve[0] - curve[bars])),
+            Series("split-step", every[bars], d[bars], d_error[bars]),
+            Series(f"near-field theory, {direction}", fine[bars], 2 * (near[0] - near[bars])),
         ]
     title, x_label = f"L = {path.distance / 1e3:g} km, D/r0 = {STRENGTH:g}", "separation (Nyquist pixels)"
     return measurements, [
