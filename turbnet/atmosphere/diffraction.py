@@ -9,8 +9,9 @@ with the amplitude cos q and as log-amplitude with sin q:
     q = \frac{\kappa^2 z c}{2k}, \quad c = \frac{L-z}{L}
 
 With q = 0 this is `turbnet.atmosphere.covariance`, the near field, D^2 >> lambda L. At a Fresnel number D^2/(lambda L)
-of 11 the tilt of one point hardly notices (0.3 %); the higher modes do (18 % at j = 11 .. 15), and so does the difference
-of the tilts of neighbours, which only small eddies make (28 % at one Nyquist pixel). Valid for weak fluctuation.
+of 11 the tilt of one point hardly notices (0.3 %); the higher modes do (18 % at j = 11 .. 15), and so does the
+difference of the tilts of neighbours, which only small eddies make (28 % at one Nyquist pixel). Valid for weak
+fluctuation.
 Source: V. I. Tatarskii, The Effects of the Turbulent Atmosphere on Wave Propagation (1971), ch. 3.
 """
 

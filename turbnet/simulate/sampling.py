@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Array
@@ -29,6 +31,10 @@ from turbnet.errors import ParameterError, check_range
 
 SAMPLES_PER_R0 = 3
 """Samples a Fried parameter must span: the phase between neighbours then stays near 1 rad rms."""
+ROOM = 0.65
+"""Share of a grid's width that the light which matters fills."""
+FRESNEL_ZONES, SPREADS = 6.0, 4.0
+"""How far from the aperture, in sqrt(lambda z) and in lambda z / r0, light at z can still reach it."""
 SLAB_RYTOV = 0.1
 """Largest Rytov variance of one slab: within it the air must change the phase only."""
 
@@ -136,9 +142,30 @@ class Sampling:
         return -np.diff(z) / (scale[:-1] * scale[1:])
 
     @property
+    def chirps(self) -> Array:
+        """lambda tau / delta_0^2 of each step, whose transfer function is exp(-i pi chirp f^2), f in cycles per sample."""
+        return self.path.wavelength * self.reduced_distances / self.spacing_aperture**2
+
+    @property
     def lit(self) -> Array:
-        """Share of the grid's width that the cone of light fills at each screen."""
+        """Share of the N samples' width that the cone of light fills at each screen."""
         return (1 - self.slabs.z / self.path.distance) * self.spacing_aperture / self.spacing
+
+    @cached_property
+    def grids(self) -> NDArray[np.intp]:
+        """Samples along a side from each screen on, (screens,): the middle of the N that matters, with room around.
+
+        Near the scene the light is narrow; near the aperture only what lies within FRESNEL_ZONES and SPREADS of it can
+        still reach it.
+        """
+        path, z = self.path, np.append(self.slabs.z, 0.0)
+        away = np.sqrt(path.wavelength * z / (1 - z / path.distance)) * FRESNEL_ZONES
+        away += path.wavelength * z / path.r0 * SPREADS
+        reach = np.minimum((path.aperture + 2 * away) / (self.extent * path.aperture), 1.0)
+        width = np.append(self.lit, 1.0) * reach * self.grid / ROOM
+        fast = [n for n in range(64, self.grid, 32) if (self.grid - n) % 2 == 0 and next_fast_len(n, real=True) == n]
+        needed = np.maximum(width[:-1], width[1:])
+        return np.array([next((n for n in fast if n >= max(need, self.across)), self.grid) for need in needed])
 
 
 @dataclass(frozen=True)
@@ -146,26 +173,26 @@ class Cost:
     """What a run takes: points x screens x grid^2.
 
     Attributes:
-        points, screens, grid: of the run.
+        points: of the run.
+        grids: samples along a side at each screen.
         screen_samples: samples of all screens together.
         bytes_per_real: 4 or 8.
     """
 
     points: int
-    screens: int
-    grid: int
+    grids: tuple[int, ...]
     screen_samples: int
     bytes_per_real: int
 
     @property
     def transforms(self) -> int:
-        """Two-dimensional FFTs, grid x grid."""
-        return 2 * self.points * self.screens
+        """Two-dimensional FFTs."""
+        return 2 * self.points * len(self.grids)
 
     @property
     def operations(self) -> float:
         """Floating-point operations of the FFTs, 5 N^2 log2 N^2 each."""
-        return self.transforms * 10 * self.grid**2 * float(np.log2(self.grid))
+        return 2 * self.points * sum(10 * n**2 * float(np.log2(n)) for n in self.grids)
 
     @property
     def memory(self) -> int:
@@ -174,6 +201,6 @@ class Cost:
 
     def __str__(self) -> str:
         return (
-            f"{self.points} points x {self.screens} screens x {self.grid}^2 samples: {self.transforms} FFTs, "
-            f"{self.operations / 1e9:.3g} GFLOP, {self.memory / 1e6:.3g} MB of screens"
+            f"{self.points} points x {len(self.grids)} screens x {self.grids[0]}^2 .. {self.grids[-1]}^2 samples: "
+            f"{self.transforms} FFTs, {self.operations / 1e9:.3g} GFLOP, {self.memory / 1e6:.3g} MB of screens"
         )

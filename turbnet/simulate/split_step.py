@@ -34,8 +34,10 @@ from turbnet.errors import ParameterError
 from turbnet.optics.propagation import frequencies
 from turbnet.simulate.sampling import Cost, Sampling
 
-LIT_TO_ABSORB = 0.45
+LIT_TO_ABSORB = 0.6
 """From this share of the grid's width on, light nears the edge and the screen's plane absorbs there."""
+CACHED, RESIDENT = 2**17, 2**24
+"""Samples propagated together on a processor, where they should stay in its cache, and on an accelerator."""
 
 
 @dataclass(frozen=True)
@@ -90,23 +92,23 @@ class SplitStep:
         start = np.round(crossing).astype(int)
         remainder = np.concatenate([crossing - start, np.zeros((1, *self.points.shape))])
         self._window = start - start.min(axis=1, keepdims=True)
-        self._centre = self._window + remainder[:-1] + (sampling.grid - 1) / 2
-        shapes = self._window.max(axis=1) + sampling.grid
+        self._centre = self._window + remainder[:-1] + (sampling.grids[:, None, None] - 1) / 2
+        shapes = self._window.max(axis=1) + sampling.grids[:, None]
         self.screens = [
             PhaseScreen((int(h), int(w)), float(step), float(r0), outer_scale, inner_scale, dtype=dtype, device=device)
             for (h, w), step, r0 in zip(shapes, sampling.spacing, sampling.slabs.r0, strict=True)
         ]
         self._axes = [_Axis(sampling, remainder[:, :, a], dtype.to_complex(), self.device) for a in (0, 1)]
-        edge, still = _edge(sampling.grid), _still_air(sampling)[self._middle]
-        self._absorber = torch.from_numpy(np.outer(edge, edge)).to(self.device, dtype.to_complex())
-        self._still = torch.from_numpy(np.outer(still, still)).to(self.device, dtype.to_complex())
+        self._absorbers = [None if edge is None else self._complex(np.outer(edge, edge)) for edge in _edges(sampling)]
+        still = _still_air(sampling)[self._middle]
+        self._still = self._complex(np.outer(still, still))
 
     @property
     def cost(self) -> Cost:
         """What propagating every point once takes."""
         samples = sum(math.prod(screen.shape) for screen in self.screens)
         size = torch.finfo(self.dtype).bits // 8
-        return Cost(len(self.points), self.sampling.screens, self.sampling.grid, samples, size)
+        return Cost(len(self.points), tuple(int(n) for n in self.sampling.grids), samples, size)
 
     def draw(self, generator: torch.Generator, count: int = 1) -> Turbulence:
         """`count` independent draws of the air that all points share."""
@@ -122,9 +124,10 @@ class SplitStep:
             points: which of the points.
         """
         draws = len(turbulence.transmissions[0])
-        field = self._propagate(turbulence.transmissions, list(points), draws)
-        middle = self._middle
-        return (field[:, middle, middle] / self._still).unflatten(0, (draws, len(points)))
+        pairs = [(draw, point) for draw in range(draws) for point in points]
+        batch = max(1, (CACHED if self.device.type == "cpu" else RESIDENT) // self.sampling.grid**2)
+        parts = [self._propagate(turbulence, pairs[i : i + batch]) for i in range(0, len(pairs), batch)]
+        return (torch.cat(parts) / self._still).unflatten(0, (draws, len(points)))
 
     def geometric_phase(self, turbulence: Turbulence, points: Sequence[int] = (0,)) -> Tensor:
         """Sum of the screens' phases along straight rays from each point, (draws, points, n, n), rad."""
@@ -151,26 +154,31 @@ class SplitStep:
         """
         return geometric + torch.angle(fields * torch.polar(torch.ones_like(geometric), -geometric))
 
-    def _propagate(self, transmissions: list[Tensor], points: list[int], draws: int) -> Tensor:
-        """(draws * points, N, N) at the aperture, draw-major."""
-        grid, lit = self.sampling.grid, self.sampling.lit
-        (source_y, step_y), (source_x, step_x) = (axis.select(points, draws) for axis in self._axes)
+    def _propagate(self, turbulence: Turbulence, pairs: list[tuple[int, int]]) -> Tensor:
+        """Field in the aperture's square for each (draw, point), (pairs, n, n)."""
+        (source_y, steps_y), (source_x, steps_x) = (axis.select([p for _, p in pairs]) for axis in self._axes)
         field = source_y[:, :, None] * source_x[:, None, :]
-        for layer, transmission in enumerate(transmissions):
-            for b in range(len(field)):
-                top, left = self._window[layer, points[b % len(points)]]
-                field[b] *= transmission[b // len(points), top : top + grid, left : left + grid]
-            if lit[layer] > LIT_TO_ABSORB:
-                field *= self._absorber
+        for layer, transmission in enumerate(turbulence.transmissions):
+            grid = int(self.sampling.grids[layer])
+            field = _resized(field, grid)
+            for wave, (draw, point) in zip(field, pairs, strict=True):
+                top, left = self._window[layer, point]
+                wave *= transmission[draw, top : top + grid, left : left + grid]
+            absorber = self._absorbers[layer]
+            if absorber is not None:
+                field *= absorber
             field = torch.fft.fft2(field)
-            field *= step_y[layer, :, :, None]
-            field *= step_x[layer, :, None, :]
+            field *= steps_y[layer][:, :, None]
+            field *= steps_x[layer][:, None, :]
             field = torch.fft.ifft2(field)
-        return field
+        return field[:, self._middle, self._middle]
+
+    def _complex(self, values: Array | NDArray[np.complex128]) -> Tensor:
+        return torch.from_numpy(values).to(self.device, self.dtype.to_complex())
 
     @property
     def _middle(self) -> slice:
-        start = (self.sampling.grid - self.sampling.across) // 2
+        start = (int(self.sampling.grids[-1]) - self.sampling.across) // 2
         return slice(start, start + self.sampling.across)
 
 
@@ -190,52 +198,56 @@ class _Axis:
 
     def __init__(self, sampling: Sampling, remainder: Array, dtype: torch.dtype, device: torch.device) -> None:
         distinct, self._which = np.unique(remainder, axis=1, return_inverse=True)
-        f = frequencies(sampling.grid, 1.0).numpy()  # cycles per sample
-        shift = distinct[:-1] - distinct[1:]
-        steps = _transfers(sampling)[1:, None] * np.exp(2j * np.pi * shift[:, :, None] * f)
-        source = _source(sampling, distinct[0])
-        self._source, self._steps = (torch.from_numpy(a).to(device, dtype) for a in (source, steps))
+        self._source = torch.from_numpy(_source(sampling, distinct[0])).to(device, dtype)
+        self._steps = []
+        for layer, shift in enumerate(distinct[:-1] - distinct[1:]):
+            transfer, f = _transfer(sampling, layer)
+            self._steps.append(torch.from_numpy(transfer * np.exp(2j * np.pi * np.outer(shift, f))).to(device, dtype))
 
-    def select(self, points: list[int], repeats: int) -> tuple[Tensor, Tensor]:
-        """Source (B, N) and transfer functions (screens, B, N) of the points, the whole repeated."""
-        which = torch.from_numpy(np.tile(self._which[points], repeats)).to(self._source.device)
-        return self._source[which], self._steps[:, which]
+    def select(self, points: list[int]) -> tuple[Tensor, list[Tensor]]:
+        """Source (B, N) and the transfer function of each step (B, N_l) of the points."""
+        which = torch.from_numpy(self._which[points]).to(self._source.device)
+        return self._source[which], [step[which] for step in self._steps]
 
 
-def _transfers(sampling: Sampling) -> NDArray[np.complex128]:
-    """exp(-i pi lambda tau f^2) of each step, (screens + 1, N)."""
-    f = frequencies(sampling.grid, 1.0).numpy()
-    rate = sampling.path.wavelength * sampling.reduced_distances / sampling.spacing_aperture**2
-    return np.asarray(np.exp(-1j * np.pi * rate[:, None] * f**2))
+def _transfer(sampling: Sampling, layer: int) -> tuple[NDArray[np.complex128], Array]:
+    """exp(-i pi lambda tau f^2) of the step from screen `layer` on, and f in cycles per sample, (N_l,) each."""
+    f = frequencies(int(sampling.grids[layer]), 1.0).numpy()
+    return np.exp(-1j * np.pi * sampling.chirps[layer + 1] * f**2), f
 
 
 def _source(sampling: Sampling, remainder: Array) -> NDArray[np.complex128]:
-    """The band-limited point source's wave at the first screen, along one axis, (len(remainder), N)."""
-    f = frequencies(sampling.grid, 1.0).numpy()
-    middle = (sampling.grid - 1) / 2 + remainder
-    spectrum = np.fft.ifftshift(_band(sampling.grid)) * _transfers(sampling)[0]
-    wave = np.fft.ifft(spectrum * np.exp(-2j * np.pi * middle[:, None] * f))
-    return np.asarray(wave * math.sqrt(sampling.grid))
+    """The band-limited point source's wave at the first screen, along one axis, (len(remainder), N_0)."""
+    grid = sampling.grid
+    f = np.arange(grid) / grid - (grid // 2) / grid
+    spectrum = _taper(2 * np.abs(f), 0.7, 0.95) * np.exp(-1j * np.pi * sampling.chirps[0] * f**2) / math.sqrt(grid)
+    first = int(sampling.grids[0])
+    samples = np.arange(first) - (first - 1) / 2 - remainder[:, None]
+    return np.asarray(np.exp(2j * np.pi * samples[:, :, None] * f) @ spectrum)
 
 
 def _still_air(sampling: Sampling) -> NDArray[np.complex128]:
     """What the source gives at the aperture without turbulence, along one axis, (N,)."""
-    wave = _source(sampling, np.zeros(1))[0]
-    for lit, transfer in zip(sampling.lit, _transfers(sampling)[1:], strict=True):
-        wave = np.fft.ifft(np.fft.fft(wave * _edge(sampling.grid) if lit > LIT_TO_ABSORB else wave) * transfer)
+    wave: NDArray[np.complex128] = _source(sampling, np.zeros(1))[0]
+    for layer, edge in enumerate(_edges(sampling)):
+        wave = _resized(torch.from_numpy(wave), int(sampling.grids[layer]), axes=1).numpy()
+        wave = np.fft.ifft(np.fft.fft(wave if edge is None else wave * edge) * _transfer(sampling, layer)[0])
     return np.asarray(wave)
 
 
-def _edge(count: int) -> Array:
-    """1 over the middle four fifths, falling to 0 at both ends like a squared cosine."""
-    return _taper(count, 0.8, 1.0)
+def _edges(sampling: Sampling) -> list[Array | None]:
+    """Absorber of each screen along one axis, (N_l,): 1 over the middle 4/5; None where light is far from the edge."""
+    lit = sampling.lit * sampling.grid / sampling.grids
+    positions = [np.abs(2 * np.arange(n) - n + 1) / n for n in sampling.grids]
+    return [_taper(p, 0.8, 1.0) if share > LIT_TO_ABSORB else None for p, share in zip(positions, lit, strict=True)]
 
 
-def _band(count: int) -> Array:
-    """Spectrum of the point source, frequency 0 at count // 2: flat over 70 % of the band, 0 from 95 % on."""
-    return _taper(count, 0.7, 0.95)
-
-
-def _taper(count: int, flat: float, end: float) -> Array:
-    position = np.abs(2 * (np.arange(count) - count // 2) / count)
+def _taper(position: Array, flat: float, end: float) -> Array:
+    """1 up to `flat`, falling like a squared cosine to 0 at `end`."""
     return np.asarray(np.cos(np.pi / 2 * np.clip((position - flat) / (end - flat), 0, 1)) ** 2)
+
+
+def _resized(field: Tensor, grid: int, axes: int = 2) -> Tensor:
+    """The field on `grid` samples about its middle along the last axes, zero beyond what it holds."""
+    margin = (grid - field.shape[-1]) // 2
+    return F.pad(field, (margin,) * 2 * axes) if margin else field
