@@ -143,7 +143,7 @@ class Sampling:
 
     @property
     def chirps(self) -> Array:
-        """lambda tau / delta_0^2 of each step, whose transfer function is exp(-i pi chirp f^2), f in cycles per sample."""
+        """lambda tau / delta_0^2 of each step; its transfer function is exp(-i pi chirp f^2), f in cycles a sample."""
         return self.path.wavelength * self.reduced_distances / self.spacing_aperture**2
 
     @property
