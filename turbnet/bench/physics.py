@@ -17,6 +17,8 @@ from turbnet.bench.measurement import Measurement, Panel, table
 from turbnet.report import Report, Row
 
 SEED = 2026
+BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+"""What encloses the table in docs/theory/validation.md."""
 
 
 @dataclass(frozen=True)
