@@ -58,6 +58,12 @@ def test_its_verdicts_follow_from_its_numbers(quick):
     assert all(abs(row["value"] / row["reference"] - 1) < 0.03 for row in held)
 
 
+@pytest.mark.slow
+def test_the_full_bench_passes(tmp_path):
+    done = turbnet("bench", "physics", "--quiet", "--json", "r.json", cwd=tmp_path)
+    assert done.returncode == 0, [line for line in done.stdout.splitlines() if "FAIL" in line]
+
+
 def test_it_draws_a_small_figure_of_each_family(quick):
     figures = sorted((quick[1] / "figures").iterdir())
     assert [f.stem for f in figures] == [

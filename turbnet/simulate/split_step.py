@@ -55,7 +55,7 @@ class Turbulence:
     @classmethod
     def of(cls, phases: list[Tensor]) -> "Turbulence":
         """The air whose screens have these phases."""
-        return cls(phases, [torch.polar(torch.ones_like(phase), phase) for phase in phases])
+        return cls(phases, [torch.complex(phase.cos(), phase.sin()) for phase in phases])
 
 
 class SplitStep:
@@ -152,7 +152,7 @@ class SplitStep:
 
         Of no use where the field has zeros in the aperture (D/r0 well above the Fresnel number's square root).
         """
-        return geometric + torch.angle(fields * torch.polar(torch.ones_like(geometric), -geometric))
+        return geometric + torch.angle(fields * torch.complex(geometric.cos(), -geometric.sin()))
 
     def _propagate(self, turbulence: Turbulence, pairs: list[tuple[int, int]]) -> Tensor:
         """Field in the aperture's square for each (draw, point), (pairs, n, n)."""
