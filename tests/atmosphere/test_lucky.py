@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from turbnet.atmosphere.lucky import (
     karhunen_loeve,
@@ -8,7 +9,7 @@ from turbnet.atmosphere.lucky import (
     lucky_probability,
     tilt_free_modes,
 )
-from turbnet.atmosphere.noll import noll_matrix, residual_variance
+from turbnet.atmosphere.noll import noll_covariance, noll_matrix, residual_variance
 from turbnet.errors import ParameterError
 
 
@@ -30,12 +31,17 @@ def test_monte_carlo_agrees_with_the_inversion(ratio):
     assert abs(probability - lucky_karhunen_loeve(ratio)) < 4 * error
 
 
-def test_one_mode_is_chi_square_by_hand():
-    # P(lambda xi^2 <= 1) of the three equal second-order modes alone would be chi-square with 3 degrees; here the
-    # inversion is checked on a case with many modes through its two limits instead.
+def test_three_equal_modes_are_chi_square():
+    # At order 2 the modes 4, 5, 6 have one variance, so P is a chi-square distribution with three degrees of freedom.
+    scale = 2.0 ** (5 / 3)
+    expected = chi2.cdf((1 - scale * residual_variance(2)) / (scale * noll_covariance(4, 4)), 3)
+    assert lucky_karhunen_loeve(2.0, order=2) == pytest.approx(expected, rel=1e-6)
+
+
+def test_limits():
     assert lucky_karhunen_loeve(0.0) == 1.0
     assert lucky_karhunen_loeve(0.5) == pytest.approx(1.0, abs=1e-9)
-    assert lucky_karhunen_loeve(60.0, order=4) == 0.0
+    assert lucky_karhunen_loeve(60.0, order=4) == 0.0  # the modes not counted are alone above 1 rad^2
 
 
 def test_fried_found_the_same_at_two():

@@ -141,10 +141,10 @@ def test_convolution_agrees_with_the_sum(shape, kernel_size):
 
 
 def test_gradients():
-    small = torch.tensor(circular(8, 4))
-    phase = torch.randn(2, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda p: optics.psf(p, small, 7, 0.8), phase)
-    assert torch.autograd.gradcheck(lambda p: optics.otf(optics.psf(p, small, 7)), phase)
+    small = torch.tensor(circular(6, 4))
+    phase = torch.randn(2, 6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p: optics.psf(p, small, 5, 0.8), phase)
+    assert torch.autograd.gradcheck(lambda p: optics.otf(optics.psf(p, small, 5)).abs(), phase)
 
 
 def test_float32_stays_float32(pupil):

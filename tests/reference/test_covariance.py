@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbnet.atmosphere.covariance import zernike_covariance, zernike_covariance_matrix
+from turbnet.atmosphere.covariance import drift_covariance, zernike_covariance, zernike_covariance_matrix
 from turbnet.atmosphere.noll import noll_matrix
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Constant, Tabulated
@@ -57,11 +57,12 @@ def disk(radii: int, angles: int, turn: float):
     return rho, theta, np.repeat(w / (2 * angles), angles)
 
 
-def direct_covariance(scene: OpticalPath, dx: float, dy: float) -> np.ndarray:
+def direct_covariance(scene: OpticalPath, dx: float, dy: float, lever=lambda s: s) -> np.ndarray:
     """-1/2 of the double disk average of Z_i(rho) Z_j(rho') D(rho, rho'), D the phase structure function.
 
-    D = 2.914 k^2 int Cn2 |R c (rho - rho') + (u - u') z/L|^(5/3) dz. No spectrum, no Bessel function and no
-    slow convergence at low wavenumbers: Zernikes above piston have zero mean, so only differences of phase matter.
+    D = 2.914 k^2 int Cn2 |R c (rho - rho') + lever (dx, dy)|^(5/3) dz, with lever = z/L for two points. No
+    spectrum, no Bessel function and no slow convergence at low wavenumbers: Zernikes above piston have zero mean, so
+    only differences of phase matter.
     """
     rho, theta, weight = disk(12, 24, 0.0)
     rho2, theta2, weight2 = disk(13, 24, 0.5)
@@ -71,11 +72,19 @@ def direct_covariance(scene: OpticalPath, dx: float, dy: float) -> np.ndarray:
     structure = np.zeros_like(lag_x)
     for z, cn2_dz in zip(*scene.layers(128), strict=True):
         s = z / scene.distance
-        structure += cn2_dz * (((1 - s) * lag_x + s * dx) ** 2 + ((1 - s) * lag_y + s * dy) ** 2) ** (5 / 6)
+        structure += cn2_dz * (((1 - s) * lag_x + lever(s) * dx) ** 2 + ((1 - s) * lag_y + lever(s) * dy) ** 2) ** (
+            5 / 6
+        )
     structure *= 2.914 * scene.wavenumber**2
     return np.array(
         [-0.5 * (zernike(i, rho, theta) * weight) @ structure @ (zernike(j, rho2, theta2) * weight2) for i, j in PAIRS]
     )
+
+
+def scales(scene):
+    """sqrt(E[a_i^2] E[a_j^2]) of each pair: what a covariance is small or large against."""
+    variance = np.diag(noll_matrix(range(2, 13))) * scene.d_over_r0 ** (5 / 3)
+    return np.array([np.sqrt(variance[i - 2] * variance[j - 2]) for i, j in PAIRS])
 
 
 @pytest.mark.parametrize("name", PROFILES)
@@ -84,9 +93,17 @@ def test_agrees_with_an_integrator_in_real_space(name, pixels):
     scene = path(PROFILES[name])
     dx, dy = pixels * scene.pixel * np.cos(0.5), pixels * scene.pixel * np.sin(0.5)
     measured = [float(zernike_covariance(scene, i, j, dx, dy)) for i, j in PAIRS]
-    variance = np.diag(noll_matrix(range(2, 13))) * scene.d_over_r0 ** (5 / 3)
-    scale = np.array([np.sqrt(variance[i - 2] * variance[j - 2]) for i, j in PAIRS])
-    np.testing.assert_allclose(measured, direct_covariance(scene, dx, dy), rtol=2e-3, atol=2e-4 * scale.min())
+    np.testing.assert_allclose(measured, direct_covariance(scene, dx, dy), rtol=2e-3, atol=2e-4 * scales(scene).min())
+
+
+@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("moved", [0.02, 0.1, 0.5])
+def test_moving_air_agrees_with_an_integrator_in_real_space(name, moved):
+    scene = path(PROFILES[name])
+    dx, dy = moved * np.cos(0.5), moved * np.sin(0.5)
+    measured = np.array([float(drift_covariance(scene, i, j, dx, dy)) for i, j in PAIRS])
+    error = measured - direct_covariance(scene, dx, dy, lever=lambda s: -1.0)
+    assert np.all(np.abs(error) < 2e-4 * scales(scene))
 
 
 def test_ramps_differ_although_their_total_is_the_same():

@@ -39,7 +39,7 @@ ORDER_MAX = 20
 def radial_covariance(n: int, n2: int, mu: int, s: Array) -> Array:
     """G_nn'mu(s), the covariance integral of one layer at the separation s >= 0 in radii.
 
-    Accurate to about 1e-6 of G at s = 0, for n + n' >= 2 (piston has none).
+    Accurate to 1e-8 of the value at s = 0 for tilts, 1e-6 for n = 7, 2e-4 for n = 20.
 
     Raises:
         ParameterError: a radial order outside 1 .. 20 in either place.
@@ -48,8 +48,7 @@ def radial_covariance(n: int, n2: int, mu: int, s: Array) -> Array:
     check_range("radial order n'", n2, 1, ORDER_MAX)
     s = np.asarray(s, dtype=np.float64)
     spline = _radial_spline(*sorted((n, n2)), mu)
-    inside = np.minimum(s, S_MAX)
-    return spline(np.arcsinh(inside)) * (inside / np.where(s == 0, 1.0, s)) ** np.where(s == 0, 0.0, n + n2 - 5 / 3)
+    return spline(np.arcsinh(np.minimum(s, S_MAX))) * (S_MAX / np.maximum(s, S_MAX)) ** (n + n2 - 5 / 3)
 
 
 def zernike_covariance(
@@ -72,21 +71,20 @@ def zernike_covariance(
     Raises:
         ParameterError: a Noll index outside its range.
     """
-    dx, dy = np.broadcast_arrays(np.asarray(dx, dtype=np.float64), np.asarray(dy, dtype=np.float64))
-    z, cn2_dz = path.quadrature() if layers is None else layers
-    shrink = 1 - z / path.distance
-    radius = path.aperture / 2
-    layer_weight = cn2_dz * shrink ** (5 / 3)
-    ratio = (z / path.distance) / (radius * shrink)
-    distance, inverse = np.unique(np.hypot(dx, dy), return_inverse=True)
-    direction = np.arctan2(dy, dx)
-    scale = 4 * np.pi**2 * path.wavenumber**2 * 0.033 * radius ** (5 / 3)
-    total = np.zeros(dx.shape)
-    (n, _), (n2, _) = noll_to_nm(i), noll_to_nm(j)
-    for mu, amplitude, shift in angular_terms(i, j):
-        by_distance = np.array([layer_weight @ radial_covariance(n, n2, mu, d * ratio) for d in distance])
-        total += scale * amplitude * np.cos(mu * direction - shift) * by_distance[inverse].reshape(dx.shape)
-    return total
+    z, _ = layers = path.quadrature() if layers is None else layers
+    return _covariance(path, i, j, dx, dy, z / path.distance, layers)
+
+
+def drift_covariance(path: OpticalPath, i: int, j: int, dx: Array | float, dy: Array | float = 0.0) -> Array:
+    """E[a_i(t) a_j(t')], rad^2, of one scene point while the wind moves all air on the path, frozen, by (dx, dy).
+
+    Args:
+        path: aperture, distance, profile, wavelength.
+        i, j: Noll indices, 2 .. 231.
+        dx, dy: wind velocity times (t - t'), m; arrays broadcast against each other.
+    """
+    z, _ = layers = path.quadrature()
+    return _covariance(path, i, j, dx, dy, np.full_like(z, -1.0), layers)
 
 
 def zernike_covariance_matrix(
@@ -117,6 +115,33 @@ def angular_terms(i: int, j: int) -> list[tuple[int, float, float]]:
             mu, total_shift = -mu, -total_shift
         terms.append((mu, norm * float((phase * 1j**mu).real), total_shift))
     return terms
+
+
+def _covariance(
+    path: OpticalPath,
+    i: int,
+    j: int,
+    dx: Array | float,
+    dy: Array | float,
+    lever: Array,
+    layers: tuple[Array, Array],
+) -> Array:
+    """Sum over layers, where the two footprints are lever * (dx, dy) apart; `lever` has one sign throughout."""
+    dx, dy = np.broadcast_arrays(np.asarray(dx, dtype=np.float64), np.asarray(dy, dtype=np.float64))
+    z, cn2_dz = layers
+    shrink, radius = 1 - z / path.distance, path.aperture / 2
+    layer_weight = cn2_dz * shrink ** (5 / 3)
+    ratio = np.abs(lever) / (radius * shrink)
+    sign = -1.0 if lever.sum() < 0 else 1.0
+    direction = np.arctan2(sign * dy, sign * dx)
+    distance, inverse = np.unique(np.hypot(dx, dy), return_inverse=True)
+    scale = 4 * np.pi**2 * path.wavenumber**2 * 0.033 * radius ** (5 / 3)
+    (n, _), (n2, _) = noll_to_nm(i), noll_to_nm(j)
+    total = np.zeros(dx.shape)
+    for mu, amplitude, shift in angular_terms(i, j):
+        by_distance = np.array([layer_weight @ radial_covariance(n, n2, mu, d * ratio) for d in distance])
+        total += scale * amplitude * np.cos(mu * direction - shift) * by_distance[inverse].reshape(dx.shape)
+    return total
 
 
 @lru_cache(maxsize=512)

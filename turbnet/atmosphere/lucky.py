@@ -67,9 +67,9 @@ def karhunen_loeve(modes: Sequence[int]) -> tuple[Array, Array]:
 def lucky_karhunen_loeve(d_over_r0: float, order: int = 12) -> float:
     r"""P by inverting the moment generating function of sum lambda_k xi_k^2, for probabilities as small as 1e-200.
 
-    .. math:: P = \frac1{2\pi i} \int_{c-i\infty}^{c+i\infty} \frac{e^{s}}{s} \prod_k (1 + 2\lambda_k s)^{-1/2}\, ds
+    .. math:: P = \frac1{2\pi i} \int \frac{e^{s}}{s} \prod_k (1 + 2\lambda_k s)^{-1/2}\, ds
 
-    along the line through the saddle point c of the integrand, where nothing cancels.
+    along a parabola around the negative axis that starts at the saddle point of the integrand, so that nothing cancels.
     """
     check_range("D/r0", d_over_r0, 0.0, 100.0)
     scale = d_over_r0 ** (5 / 3)
@@ -85,7 +85,8 @@ def lucky_karhunen_loeve(d_over_r0: float, order: int = 12) -> float:
     peak = exponent(saddle).real
 
     def integrand(t: float) -> float:
-        return float(np.exp(exponent(saddle * (1 + 1j * t)) - peak).real)
+        s, slope = saddle * (1 + 1j * t - 0.25 * t**2), 1j - 0.5 * t
+        return float((np.exp(exponent(s) - peak) * slope).imag)
 
     integral = quad(integrand, 0, np.inf, limit=500, epsabs=1e-10)[0]
     return float(np.exp(peak) * saddle * integral / np.pi)
