@@ -81,12 +81,13 @@ def table(measurements: list[Measurement]) -> str:
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a panel; with `error` it is drawn as points with bars."""
+    """One line of a panel: theory; with `error`, points with bars of two standard errors; or an approximation."""
 
     label: str
     x: Array
     y: Array
     error: Array | None = None
+    approximate: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,22 +102,30 @@ class Panel:
     scale: tuple[str, str] = ("linear", "linear")
 
     def draw(self, folder: Path) -> Path:
-        """Write `folder`/`name`.png; each measured series takes the colour of the theory series before it."""
+        """Write `folder`/`name`.png; points and approximations take the colour of the theory before them."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(5.6, 3.8), layout="constrained")
         axes = figure.subplots()
-        colour = None
+        colour, markers = None, iter("")
         for line in self.series:
-            if line.error is None:
-                (drawn,) = axes.plot(line.x, line.y, label=line.label, linewidth=1.3)
-                colour = drawn.get_color()
-            else:
-                bars = 2 * line.error
+            if line.error is not None:
                 axes.errorbar(
-                    line.x, line.y, bars, fmt=".", color=colour, label=line.label, markersize=4, elinewidth=0.8
+                    line.x,
+                    line.y,
+                    2 * line.error,
+                    fmt=next(markers),
+                    color=colour,
+                    label=line.label,
+                    markersize=4,
+                    elinewidth=0.8,
                 )
+            elif line.approximate:
+                axes.plot(line.x, line.y, "--", color=colour, label=line.label, linewidth=1.0)
+            else:
+                (drawn,) = axes.plot(line.x, line.y, label=line.label, linewidth=1.3)
+                colour, markers = drawn.get_color(), iter(".x+")
         axes.set(xlabel=self.x_label, ylabel=self.y_label, title=self.title, xscale=self.scale[0], yscale=self.scale[1])
         axes.title.set_fontsize(10)
         axes.legend(fontsize=7)

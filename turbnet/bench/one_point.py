@@ -179,7 +179,7 @@ def _short_exposure(run: OnePoint) -> tuple[list[Measurement], Panel]:
             series += [
                 Series(f"exact, D/r0 = {strength:g}", frequency, expected),
                 Series("split-step", frequency[used], measured[used], error[used]),
-                Series(f"Fried, D/r0 = {strength:g}", frequency, fried),
+                Series(f"Fried, D/r0 = {strength:g}", frequency, fried, approximate=True),
             ]
     return measurements, Panel("short-exposure", "Tilt-free (short-exposure) OTF", "frequency / cutoff", "OTF", series)
 
@@ -202,7 +202,7 @@ def _lucky(run: OnePoint) -> tuple[list[Measurement], Panel]:
     series = [
         Series("Karhunen-Loève modes", axis, np.array([lucky_karhunen_loeve(float(d)) for d in axis])),
         Series("split-step", np.array(LUCKY), np.array(measured), np.array(error)),
-        Series("Fried", axis[axis >= 3.5], lucky_probability(axis[axis >= 3.5])),
+        Series("Fried", axis[axis >= 3.5], lucky_probability(axis[axis >= 3.5]), approximate=True),
     ]
     return measurements, Panel("lucky", "Probability of a lucky frame", "D/r0", "P", series, ("linear", "log"))
 

@@ -79,7 +79,7 @@ def _tilts(path: OpticalPath, tilts: Array) -> tuple[list[Measurement], list[Pan
         d_series += [
             Series(f"theory, {direction}", fine[bars], 2 * (curve[0] - curve[bars])),
             Series("split-step", every[bars], d[bars], d_error[bars]),
-            Series(f"near-field theory, {direction}", fine[bars], 2 * (near[0] - near[bars])),
+            Series(f"near field, {direction}", fine[bars], 2 * (near[0] - near[bars]), approximate=True),
         ]
     title, x_label = f"L = {path.distance / 1e3:g} km, D/r0 = {STRENGTH:g}", "separation (Nyquist pixels)"
     return measurements, [
