@@ -14,7 +14,7 @@ from turbnet.atmosphere.covariance import zernike_covariance
 from turbnet.atmosphere.diffraction import diffracted_covariance
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Array
-from turbnet.bench.measurement import Measurement, Panel, Series, mean_and_error
+from turbnet.bench.measurement import Measurement, Panel, Series, mean_and_error, ratio_and_error
 from turbnet.simulate.sampling import Sampling
 from turbnet.simulate.split_step import SplitStep
 from turbnet.simulate.wavefront import Aperture
@@ -29,20 +29,23 @@ def measure(seed: int, track: Iterable[int]) -> tuple[list[Measurement], list[Pa
     path = OpticalPath.from_d_over_r0(STRENGTH)
     columns = np.concatenate([[0], SEPARATIONS]) * path.pixel
     split_step = SplitStep(Sampling(path), np.stack([0 * columns, columns], axis=1))
-    aperture = Aperture(split_step.sampling.across, 15)
+    aperture = Aperture(split_step.sampling.across, 45)
     generator = torch.Generator().manual_seed(seed)
     points = range(len(columns))
-    tilts, overlaps, logs = [], [], []
+    tilts, squares, overlaps, logs = [], [], [], []
     for _ in track:
         air = split_step.draw(generator, BATCH)
         field = split_step.pupil_fields(air, points)
-        phase = split_step.phase(field, split_step.geometric_phase(air, points))
-        tilts.append(aperture.coefficients(phase)[..., 1:3])
+        rays = split_step.geometric_phase(air, points)
+        wave = aperture.coefficients(split_step.phase(field, rays))
+        tilts.append(wave[..., 1:3])
+        squares.append(torch.stack([wave[:, 0], aperture.coefficients(rays[:, 0])], dim=-1).square())
         inner = field[..., aperture.inside]
         overlaps.append((inner[:, 1:] * inner[:, :1].conj()).mean(-1).real)
         amplitude = inner[:, 0].abs().log()
         logs.append(torch.stack([amplitude.mean(-1), amplitude.square().mean(-1)], dim=-1))
     measurements, panels = _tilts(path, torch.cat(tilts).double().numpy())
+    measurements += _diffraction(path, torch.cat(squares).double().numpy())
     measurements.append(_isoplanatic_angle(path, torch.cat(overlaps).double().numpy()))
     measurements.append(_log_amplitude(path, torch.cat(logs).double().numpy()))
     return measurements, panels
@@ -86,6 +89,17 @@ def _tilts(path: OpticalPath, tilts: Array) -> tuple[list[Measurement], list[Pan
         Panel("z-tilt", f"Z-tilt, {title}", x_label, "covariance ($\\mu$rad$^2$)", z_series, ("log", "linear")),
         Panel("d-tilt", f"D-tilt, {title}", x_label, "structure function ($\\mu$rad$^2$)", d_series, ("log", "log")),
     ]
+
+
+def _diffraction(path: OpticalPath, squares: Array) -> list[Measurement]:
+    """Variance of the wave's coefficients over that of straight rays through the same screens, (draws, modes, 2)."""
+    ratio, error = ratio_and_error(squares[..., 0], squares[..., 1])
+    measurements = []
+    for j in (2, 4, 7, 11, 14):
+        theory = float(diffracted_covariance(path, j, j, 0.0) / zernike_covariance(path, j, j, 0.0))
+        name = f"variance of the wave over that of rays, j = {j}"
+        measurements.append(Measurement(name, theory, ratio[j - 1], error[j - 1]))
+    return measurements
 
 
 def _isoplanatic_angle(path: OpticalPath, overlaps: Array) -> Measurement:
