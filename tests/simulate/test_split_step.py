@@ -28,7 +28,7 @@ def air_of(split_step: SplitStep, layer: int, phase) -> Turbulence:
     spacing = split_step.sampling.spacing[layer]
     y, x = ((torch.arange(n, dtype=split_step.dtype) - (n - 1) / 2) * spacing for n in phases[layer].shape[1:])
     phases[layer] = (phase(y[:, None], x) + torch.zeros_like(phases[layer][0]))[None]
-    return Turbulence.of(phases)
+    return Turbulence(phases)
 
 
 def test_still_air_gives_a_flat_field_and_the_airy_pattern():
@@ -137,7 +137,7 @@ def test_the_part_of_the_grid_it_runs_on_is_enough(distance, strength):
         split_step = SplitStep(sampling)
         margins = [(256 - int(n)) // 2 for n in sampling.grids]
         cut = [phase[:, m : 256 - m, m : 256 - m] for m, phase in zip(margins, air.phases, strict=True)]
-        fields.append(split_step.pupil_fields(Turbulence.of(cut)))
+        fields.append(split_step.pupil_fields(Turbulence(cut)))
     error = (fields[1] - fields[0]).abs().square().mean() / fields[0].abs().square().mean()
     assert error.sqrt() < 0.03
 
@@ -222,6 +222,12 @@ def test_bad_points_are_named():
     for points in ([1.0, 2.0], [(0.0, math.nan)], [(0.0, 1.0, 2.0)]):
         with pytest.raises(ParameterError, match="points must be finite"):
             SplitStep(Sampling(STILL), points)
+
+
+def test_air_drawn_for_other_points_is_refused():
+    air = SplitStep(Sampling(NEAR)).draw(torch.Generator())
+    with pytest.raises(ParameterError, match="other points"):
+        SplitStep(Sampling(NEAR), point_grid(NEAR, 2, 2, 9.0)).pupil_fields(air)
 
 
 def small_run() -> SplitStep:

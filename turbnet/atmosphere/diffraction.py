@@ -26,13 +26,17 @@ from turbnet.optics.zernike import fourier_radial, noll_to_nm
 LAYERS = 48
 
 
-def diffracted_covariance(path: OpticalPath, i: int, j: int, dx: Array | float) -> Array:
+def diffracted_covariance(
+    path: OpticalPath, i: int, j: int, dx: Array | float, layers: tuple[Array, Array] | None = None
+) -> Array:
     """E[a_i(u) a_j(u')] of the phase with diffraction, rad^2, for u - u' = (dx, 0).
 
     Args:
         path: aperture, distance, profile, wavelength.
         i, j: Noll indices, at least 2.
         dx: separations in the scene, m, any shape.
+        layers: points z (m) and weights Cn2 dz (m^(1/3)) of a layered atmosphere, such as that of a split-step run's
+            screens; by default the continuous path.
     """
     dx = np.asarray(dx, dtype=np.float64)
     (n, _), (n2, _) = noll_to_nm(i), noll_to_nm(j)
@@ -44,7 +48,7 @@ def diffracted_covariance(path: OpticalPath, i: int, j: int, dx: Array | float) 
     t = (panels[:-1, None] + half * (gauss + 1)).ravel()
     x, step = t**3, (half * weight).ravel() * 3 * t**2
     total = np.zeros(dx.shape)
-    for z, cn2_dz in zip(*path.layers(LAYERS), strict=True):
+    for z, cn2_dz in zip(*(layers or path.layers(LAYERS)), strict=True):
         c = 1 - z / path.distance
         kappa = x / (c * radius)
         filtered = np.cos(kappa**2 * z * c / (2 * path.wavenumber)) ** 2 * fourier_radial(n, x) * fourier_radial(n2, x)

@@ -56,7 +56,7 @@ class OnePoint:
             air = self.split_step.draw(generator, BATCH)
             for strength in STRENGTHS:
                 scale = (strength / max(STRENGTHS)) ** (5 / 6)
-                self._add(strength, Turbulence.of([phase * scale for phase in air.phases]))
+                self._add(strength, Turbulence([phase * scale for phase in air.phases]))
 
     def _add(self, strength: float, air: Turbulence) -> None:
         field = self.split_step.pupil_fields(air)[:, 0]

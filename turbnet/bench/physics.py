@@ -50,7 +50,7 @@ class Physics:
 @torch.no_grad()
 def run(quick: bool = False, quiet: bool = False) -> Physics:
     """Measure everything: minutes, or about half a minute if `quick` (a smoke test with wide error bars)."""
-    one, two, screens, pairs = (96, 80, 40, 8) if quick else (3200, 1200, 1500, 40)
+    one, two, screens, pairs = (96, 80, 40, 8) if quick else (2400, 800, 1500, 40)
     with _bars(quiet) as bar:
         speed = split_step_speed.measure(pairs)
         families = [
