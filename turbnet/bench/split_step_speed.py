@@ -16,7 +16,7 @@ POINTS, LIMIT = 32, 1.30
 def measure(repeats: int, chunk: int = 8) -> list[Row]:
     """Time of a 32 x 32-point, 10-screen, 256^2 field over that of its 20,480 FFTs of 256^2; allowed: 1.30.
 
-    Both are timed in turn on one chunk of points after the other, `repeats` times, on one core (points and FFTs alike
+    Both are timed in turn on one chunk of points after the other, `repeats` times, on one thread (points and FFTs alike
     are independent of each other, so cores multiply both); the ratio of each pair cancels what else the machine is
     doing, and the median of the pairs is reported. The FFTs run two
     at a time, which is when they are quickest. The field itself runs on smaller grids where that loses nothing (see
@@ -27,14 +27,11 @@ def measure(repeats: int, chunk: int = 8) -> list[Row]:
     air = split_step.draw(torch.Generator().manual_seed(0))
     sizes = [int(n) for n in split_step.sampling.grids]
     times = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     for repeat in range(repeats + 1):
         first = (repeat * chunk) % len(split_step.points)
         start = time.perf_counter()
         split_step.pupil_fields(air, range(first, first + chunk))
         times.append((time.perf_counter() - start, _transforms([256] * len(sizes), chunk), _transforms(sizes, chunk)))
-    torch.set_num_threads(threads)
     field, whole, own = np.array(times[1:]).T  # the first round warms up
     ratio, own_ratio = float(np.median(field / whole)), float(np.median(field / own))
     seconds = float(np.median(field)) / chunk * len(split_step.points)

@@ -2,7 +2,8 @@
 
 The folder of a run holds `run.json`, which says what is computed, and one file for every chunk of points. Each appears
 whole or not at all. The air is drawn anew from the seed, and a chunk depends on nothing but the air and its own points,
-so an interrupted run gives to the last bit what an uninterrupted one does.
+so an interrupted run gives to the last bit what an uninterrupted one does. The path enters `run.json` as its repr: a
+profile of one's own should be a dataclass, or state its values in another way.
 """
 
 import hashlib
