@@ -12,8 +12,9 @@ through the aperture, which air does not change: a uniform scene looks uniform t
 denominator it would flicker by 10 % at D/r0 = 2 and 19 % at 4.5.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -34,17 +35,24 @@ class Turbulent:
 
     Attributes:
         frames: what the camera sees.
-        blur_only: the scene through the same blur without tilt: what a perfect tilt removal would return.
         tilt_only: the scene moved but not blurred.
         tilt: where each scene point moved, (B, T, 2, H, W), pixels, x then y. Sampling `frames` at x + tilt(x) undoes it.
         draw: the atmosphere, to be applied again.
     """
 
     frames: Tensor
-    blur_only: Tensor
     tilt_only: Tensor
     tilt: Tensor
     draw: Draw
+    _blur_only: Callable[[], Tensor]
+
+    @cached_property
+    def blur_only(self) -> Tensor:
+        """The scene through the same blur without tilt: what a perfect tilt removal would return.
+
+        Half the work of a simulation, done when it is asked for.
+        """
+        return self._blur_only()
 
 
 class Simulator(nn.Module):
@@ -125,13 +133,12 @@ class Simulator(nn.Module):
         tilts, high = draw.tilt.flatten(0, 1), draw.high.flatten(0, 1)
 
         moved = tilt(padded, tilts, draw.stride)
-        if bool(draw.coefficients.detach().any()):
-            weights = blur_weights(high, self.basis)
-            seen = blur(moved, carry(weights, tilts, draw.stride), self.basis, draw.stride)
-            unmoved = blur(padded, weights, self.basis, draw.stride)
-        else:  # still air: the scene as it is; the aperture's own diffraction is part of every scene
-            seen, unmoved = moved, padded
-        tilt_map = upsample(tilts, draw.stride, *padded.shape[-2:])
+        still_air = not bool(draw.coefficients.detach().any())
+        weights = blur_weights(high, self.basis) if not still_air else high[:, :0]
+
+        def blurred(scene: Tensor, carried: Tensor) -> Tensor:
+            # Still air leaves the scene as it is: the aperture's own diffraction is part of every scene.
+            return picture(scene if still_air else blur(scene, carried, self.basis, draw.stride))
 
         def crop(x: Tensor) -> Tensor:
             m = self.margin
@@ -141,7 +148,13 @@ class Simulator(nn.Module):
             x = crop(x)
             return x[:, :, :-1] / x[:, :, -1:].clamp(min=1e-3) if self.uniform else x
 
-        return Turbulent(self.sensor(picture(seen), noise_seed), picture(unmoved), picture(moved), crop(tilt_map), draw)
+        return Turbulent(
+            frames=self.sensor(blurred(moved, carry(weights, tilts, draw.stride)), noise_seed),
+            tilt_only=picture(moved),
+            tilt=crop(upsample(tilts, draw.stride, *padded.shape[-2:])),
+            draw=draw,
+            _blur_only=lambda: blurred(padded, weights),
+        )
 
 
 def _reflect(image_BCHW: Tensor, margin: int) -> Tensor:

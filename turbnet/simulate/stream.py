@@ -1,6 +1,7 @@
 """Turbulence on a clip of any length, one frame in memory at a time."""
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 
 import numpy as np
 import torch
@@ -45,12 +46,17 @@ def simulate_stream(
             seen = simulator(to_linear(picture), draw)
             noise_seed = int(np.random.SeedSequence([seed, number, 1]).generate_state(1)[0])
             yield Turbulent(
-                to_srgb(sensor(seen.frames, noise_seed).clamp(0, 1)),
-                to_srgb(seen.blur_only.clamp(0, 1)),
-                to_srgb(seen.tilt_only.clamp(0, 1)),
-                seen.tilt,
-                draw,
+                frames=to_srgb(sensor(seen.frames, noise_seed).clamp(0, 1)),
+                tilt_only=to_srgb(seen.tilt_only.clamp(0, 1)),
+                tilt=seen.tilt,
+                draw=draw,
+                _blur_only=partial(_encoded_blur_only, seen),
             )
+
+
+def _encoded_blur_only(seen: Turbulent) -> torch.Tensor:
+    with torch.no_grad():
+        return to_srgb(seen.blur_only.clamp(0, 1))
 
 
 def to_frame(picture_11CHW: torch.Tensor) -> Frame:
