@@ -22,6 +22,15 @@ FAR = OpticalPath.from_d_over_r0(2.0, distance=7000.0)
 STILL = OpticalPath(0.2034, 1000.0, Constant(0.0))
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Operations this small lose more than they gain by a second thread where another process has its core."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 def air_of(split_step: SplitStep, layer: int, phase) -> Turbulence:
     """Air whose only phase is `phase(y, x)` on one screen, in metres from the screen's middle."""
     phases = [torch.zeros(1, *screen.shape, dtype=split_step.dtype) for screen in split_step.screens]

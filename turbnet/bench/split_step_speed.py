@@ -16,10 +16,10 @@ POINTS, LIMIT = 32, 1.30
 def measure(repeats: int, chunk: int = 8) -> list[Row]:
     """Time of a 32 x 32-point, 10-screen, 256^2 field over that of its 20,480 FFTs of 256^2; allowed: 1.30.
 
-    Both are timed in turn on one chunk of points after the other, `repeats` times, on one thread (points and FFTs alike
-    are independent of each other, so cores multiply both); the ratio of each pair cancels what else the machine is
-    doing, and the median of the pairs is reported. The FFTs run two
-    at a time, which is when they are quickest. The field itself runs on smaller grids where that loses nothing (see
+    Both are timed in turn on one chunk of points after the other, `repeats` times, on the one thread that the bench
+    sets (points and FFTs alike are independent of each other, so cores multiply both); the ratio of each pair cancels
+    what else the machine is doing, and the median of the pairs is reported. The FFTs run two at a time, which is when
+    they are quickest. The field itself runs on smaller grids where that loses nothing (see
     `turbnet.simulate.sampling.Sampling.grids`); a second row gives its time over that of just the FFTs it runs.
     """
     path = OpticalPath.from_d_over_r0(3.0)
