@@ -24,4 +24,4 @@ def test_links_lead_where_they_say(page):
         file = (page.parent / target.partition("#")[0]).resolve()
         assert file.exists(), f"{page.name}: {target}"
         if code and file.suffix == ".py" and text.isidentifier():
-            assert re.search(rf"^(def|class) {text}\b", file.read_text(encoding="utf-8"), re.M), f"{text} in {target}"
+            assert re.search(rf"^ *(def|class) {text}\b", file.read_text(encoding="utf-8"), re.M), f"{text} in {target}"

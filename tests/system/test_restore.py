@@ -155,7 +155,7 @@ def bad_files(model, tmp_path_factory) -> Path:
         ("good.tiff -o out.tiff --model good.onnx --window 0", "window = 0 frames is outside"),
         ("good.tiff -o out.tiff --model good.onnx --threads -2", "threads = -2 is outside"),
         ("good.tiff -o out.tiff --model good.onnx --crop 0,0,50,50", "crop"),
-        ("good.tiff -o out.tiff --model good.onnx --crop 0,0,x", "--crop 0,0,x: give left,top,width,height"),
+        ("good.tiff -o out.tiff --model good.onnx --crop 0,0,x", "--crop 0,0,x: give LEFT,TOP,WIDTH,HEIGHT"),
         ("good.tiff --model good.onnx", "--output"),
         ("good.tiff -o out.tiff --model good.onnx --tile many", "--tile"),
     ],
