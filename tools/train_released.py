@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument(
         "--data", default="photographs of a user's folder, rendered text", help="what the card says of it"
     )
+    parser.add_argument("--history", default="one uninterrupted recipe", help="what the card says of how it went")
     parser.add_argument("--output", type=Path, default=Path("outputs/released"))
     parser.add_argument("--weights", type=Path, default=Path(__file__).parents[1] / "turbnet" / "weights")
     parser.add_argument("--threads", type=int, default=2)
@@ -55,6 +56,7 @@ def main() -> None:
         "data": options.data,
         "recipe": "python tools/train_released.py --pictures FOLDER",
         "steps": steps,
+        "history": options.history,
     }
     for name, source in (("photographs", Pictures(embedded_paths("test"), (0.4, 0.7))), ("text", Text())):
         for strength in STRENGTHS:
