@@ -43,6 +43,12 @@ def test_weights_of_the_components_are_read_by_the_dual():
     torch.testing.assert_close(gram, torch.eye(12), atol=1e-4, rtol=0)
 
 
+def test_projection_is_that_of_the_psfs():
+    basis = psf_basis(12, 3.0, 3.0)
+    high = random_high(600, 4.0, seed=3)
+    torch.testing.assert_close(basis.project(high), basis.weights(tilt_free_psf(high)), atol=1e-4, rtol=1e-4)
+
+
 def test_errors_show_less_in_pictures_than_with_plain_principal_components():
     """Error of a blurred 1/f picture with 10 components against that with 10 plain principal components."""
     psf = tilt_free_psf(random_high(300, 3.0, seed=11))

@@ -10,7 +10,7 @@ indexed by the source.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -27,32 +27,33 @@ _PUPIL = 16  # samples across the aperture; twice as many in its Fourier plane m
 KERNEL = 2 * _PUPIL - 1
 """Width of a PSF kernel, pixels."""
 
-_CHUNK = 8192  # PSFs at a time, so that memory does not grow with the picture
+_CHUNK = 256  # PSFs at a time: what one step leaves is still in the processor's cache at the next
 
 
 @lru_cache
-def _pupil(modes: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The aperture on a (2 _PUPIL)^2 grid: index of each sample, its part inside the disk, and Z_4..Z_modes there.
+def _pupil(modes: int) -> tuple[Tensor, Tensor]:
+    """The aperture on a _PUPIL^2 grid: the part of each sample inside the disk, and Z_4..Z_modes there, (modes-3, samples).
 
     Counting samples at the rim by the part of their area inside makes sixteen across as good as many more.
     """
-    part = circular(_PUPIL, subsamples=16)
-    rows, columns = np.nonzero(part)
-    x, y = (axis[rows, columns] for axis in pupil_grid(_PUPIL))
+    x, y = pupil_grid(_PUPIL)
     basis = zernike_basis(range(4, modes + 1), np.hypot(x, y), np.arctan2(y, x))
-    index = torch.as_tensor(rows * 2 * _PUPIL + columns)
-    return index, torch.as_tensor(part[rows, columns]), torch.as_tensor(basis)
+    part = circular(_PUPIL, subsamples=16)
+    return torch.as_tensor(part).flatten(), torch.as_tensor(basis).flatten(1)
+
+
+def _spread(high_PN: Tensor) -> Tensor:
+    """|F{P e^{j phi}}|^2 in FFT order, not normalised, (P, 2 _PUPIL, 2 _PUPIL)."""
+    part, basis = _pupil(high_PN.shape[-1] + 3)
+    phase = high_PN @ basis.to(high_PN)
+    wave = torch.polar(part.to(phase).expand_as(phase), phase).view(-1, _PUPIL, _PUPIL)
+    field = torch.fft.fft2(wave, s=(2 * _PUPIL, 2 * _PUPIL))
+    return field.real.square() + field.imag.square()
 
 
 def tilt_free_psf(high_PN: Tensor) -> Tensor:
     """Tilt-free PSFs (P, KERNEL, KERNEL) of coefficients a_4..a_J (P, J-3), rad; each sums to one."""
-    index, part, basis = _pupil(high_PN.shape[-1] + 3)
-    phase = high_PN @ basis.to(high_PN)
-    wave = torch.polar(part.to(phase).expand_as(phase), phase)
-    size = 2 * _PUPIL
-    field = wave.new_zeros((len(wave), size * size)).index_copy(1, index.to(wave.device), wave)
-    psf = torch.fft.fft2(field.view(-1, size, size)).abs().square()
-    psf = torch.fft.fftshift(psf, dim=(-2, -1))[:, 1:, 1:]  # odd, centred on the zero shift
+    psf = torch.fft.fftshift(_spread(high_PN), dim=(-2, -1))[:, 1:, 1:]  # odd, centred on the zero shift
     return psf / psf.sum(dim=(-2, -1), keepdim=True)
 
 
@@ -73,6 +74,20 @@ class PSFBasis:
     def weights(self, psf_Pkk: Tensor) -> Tensor:
         """Weights of the components in PSFs, (P, M)."""
         return (psf_Pkk - self.mean.to(psf_Pkk)).flatten(1) @ self.dual.flatten(1).T.to(psf_Pkk)
+
+    def project(self, high_PN: Tensor) -> Tensor:
+        """`weights(tilt_free_psf(high))`, (P, M), without making the PSFs: one product with |F|^2 as it comes."""
+        parts = []
+        for chunk in high_PN.split(_CHUNK):
+            products = _spread(chunk).flatten(1) @ self._in_fft_order.to(high_PN)
+            parts.append(products[:, :-1] / products[:, -1:] - (self.dual * self.mean).sum((1, 2)).to(high_PN))
+        return torch.cat(parts)
+
+    @cached_property
+    def _in_fft_order(self) -> Tensor:
+        """The dual and a sum over the kernel as columns, (4 _PUPIL^2, M + 1)."""
+        columns = F.pad(torch.cat((self.dual, torch.ones_like(self.mean)[None])), (1, 0, 1, 0))
+        return torch.fft.ifftshift(columns, dim=(-2, -1)).flatten(1).T.contiguous()
 
     def psf(self, weights_PM: Tensor) -> Tensor:
         """PSFs (P, KERNEL, KERNEL) from their weights."""
@@ -141,8 +156,7 @@ def blur_weights(high_BNhw: Tensor, basis: PSFBasis) -> Tensor:
     if not len(basis.components):
         return high_BNhw.new_zeros((batch, 0, h, w))
     points = high_BNhw.permute(0, 2, 3, 1).reshape(-1, modes)
-    weights = torch.cat([basis.weights(tilt_free_psf(chunk)) for chunk in points.split(_CHUNK)])
-    return weights.view(batch, h, w, -1).permute(0, 3, 1, 2)
+    return basis.project(points).view(batch, h, w, -1).permute(0, 3, 1, 2)
 
 
 def blur(image_BCHW: Tensor, weights_BMhw: Tensor, basis: PSFBasis, stride: int) -> Tensor:
