@@ -52,8 +52,8 @@ class Physics:
 def run(quick: bool = False, quiet: bool = False) -> Physics:
     """Measure everything: minutes, or about half a minute if `quick` (a smoke test with wide error bars)."""
     one, two, screens, pairs = (64, 40, 40, 8) if quick else (2400, 800, 1500, 40)
+    speed = split_step_speed.measure(pairs, torch.get_num_threads())
     with _one_thread(), _bars(quiet) as bar:
-        speed = split_step_speed.measure(pairs)
         families = [
             screen_structure.measure(screens, SEED),
             one_point.measure(SEED + 1, bar("one point", one // one_point.BATCH)),

@@ -23,6 +23,7 @@ from turbnet._version import __version__
 from turbnet.errors import InputError, ParameterError, check_range
 from turbnet.media.atomic import atomic_path
 from turbnet.optics.superposition import scatter
+from turbnet.simulate.parallel import on_all_cores
 from turbnet.simulate.split_step import SplitStep
 from turbnet.simulate.wavefront import Aperture
 
@@ -61,7 +62,7 @@ def run_points(
     seed: int = 0,
     size: int = 33,
     q: float = 1.0,
-    chunk: int = 8,
+    chunk: int = 4,
     *,
     quiet: bool = False,
 ) -> PointField:
@@ -91,11 +92,11 @@ def run_points(
     console = Console(stderr=True, quiet=quiet)
     if missing:
         console.print(str(split_step.cost), highlight=False)
-        done = len(files) - len(missing)
-        for start, file in _tracked(missing, done, console):
-            if start == missing[0][0]:
-                turbulence = split_step.draw(torch.Generator().manual_seed(seed))
-                aperture = Aperture(split_step.sampling.across, MODES, turbulence.phases[0])
+        turbulence = split_step.draw(torch.Generator().manual_seed(seed))
+        aperture = Aperture(split_step.sampling.across, MODES, turbulence.phases[0])
+
+        def propagate(piece: tuple[int, Path]) -> None:
+            start, file = piece
             points = range(start, min(start + chunk, len(split_step.points)))
             fields = split_step.pupil_fields(turbulence, points)[0]
             phase = split_step.phase(fields, split_step.geometric_phase(turbulence, points)[0])
@@ -108,6 +109,12 @@ def run_points(
             }
             with atomic_path(file) as temporary:
                 save_file({name: value.cpu().contiguous() for name, value in state.items()}, temporary)
+
+        # A GPU takes one piece at a time, and all of it.
+        cores = torch.get_num_threads() if turbulence.phases[0].device.type == "cpu" else 1
+        pieces = on_all_cores(propagate, missing, cores)
+        for _ in _tracked(pieces, len(files) - len(missing), len(files), console):
+            pass
     try:
         states = [load_file(file) for file in files]
     except (OSError, SafetensorError) as error:
@@ -145,10 +152,10 @@ def _claim(folder: Path, split_step: SplitStep, request: dict[str, float]) -> No
         )
 
 
-def _tracked(items: list[tuple[int, Path]], done: int, console: Console) -> Iterator[tuple[int, Path]]:
+def _tracked(pieces: Iterator[None], done: int, total: int, console: Console) -> Iterator[None]:
     columns = (TextColumn("split-step"), BarColumn(), MofNCompleteColumn(), TextColumn("chunks"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=console.quiet) as progress:
-        task = progress.add_task("", total=done + len(items), completed=done)
-        for item in items:
-            yield item
+        task = progress.add_task("", total=total, completed=done)
+        for piece in pieces:
             progress.advance(task)
+            yield piece
