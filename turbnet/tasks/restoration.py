@@ -44,7 +44,7 @@ class Restoration(SimulatedTask):
         part = self.net.tcja if self.hparams["freeze_tilt"] else self.net
         return part.parameters()
 
-    def _step(self, batch: Scene, stage: str) -> Tensor:
+    def step(self, batch: Scene, stage: str) -> Tensor:
         pair = self.pair(batch)
         restored, registered = self.net.stages(pair.frames)
         loss = charbonnier(restored, pair.target)
@@ -61,9 +61,3 @@ class Restoration(SimulatedTask):
             values["psnr_mean"] = psnr(pair.frames.mean(1, keepdim=True).expand_as(pair.frames), pair.target)
         self.report(stage, values, len(pair.frames))
         return loss
-
-    def training_step(self, batch: Scene, index: int) -> Tensor:
-        return self._step(batch, "train")
-
-    def validation_step(self, batch: Scene, index: int) -> None:
-        self._step(batch, "val")

@@ -1,6 +1,7 @@
 """What every task shares that learns from simulated pairs: the simulator in the loop, the optimiser, the schedule."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -96,6 +97,16 @@ class SimulatedTask(L.LightningModule):
                 batch_size=clips,
                 sync_dist=stage != "train",
             )
+
+    @abstractmethod
+    def step(self, batch: Scene, stage: str) -> Tensor:
+        """Loss of one batch; reports what it measures under `stage`, "train" or "val"."""
+
+    def training_step(self, batch: Scene, index: int) -> Tensor:
+        return self.step(batch, "train")
+
+    def validation_step(self, batch: Scene, index: int) -> None:
+        self.step(batch, "val")
 
     def configure_optimizers(self) -> Any:
         """AdamW, linear warm-up, cosine decay to zero at the last step."""

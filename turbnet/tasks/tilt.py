@@ -26,7 +26,7 @@ class TiltRemoval(SimulatedTask):
         """Only the tilt net."""
         return self.net.tilt.parameters()
 
-    def _step(self, batch: Scene, stage: str) -> Tensor:
+    def step(self, batch: Scene, stage: str) -> Tensor:
         pair = self.pair(batch)
         registered = self.net.tilt(pair.frames)
         distance = registration_loss(pair.frames, pair.blur_only, registered.tilts)
@@ -38,9 +38,3 @@ class TiltRemoval(SimulatedTask):
             values["psnr_input"] = psnr(pair.frames, pair.blur_only)
         self.report(stage, values, len(pair.frames))
         return loss
-
-    def training_step(self, batch: Scene, index: int) -> Tensor:
-        return self._step(batch, "train")
-
-    def validation_step(self, batch: Scene, index: int) -> None:
-        self._step(batch, "val")
