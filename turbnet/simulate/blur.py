@@ -27,7 +27,7 @@ _PUPIL = 16  # samples across the aperture; twice as many in its Fourier plane m
 KERNEL = 2 * _PUPIL - 1
 """Width of a PSF kernel, pixels."""
 
-_CHUNK = 256  # PSFs at a time: what one step leaves is still in the processor's cache at the next
+_CHUNK = 1024  # PSFs at a time: what one step leaves is still in the processor's cache at the next
 
 
 @lru_cache

@@ -84,7 +84,11 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image_BCHW: Tensor, grid_BHW2: Tensor) -> Tensor:
         ctx.save_for_backward(image_BCHW, grid_BHW2)
-        return _sampling_adjoint(image_BCHW, image_BCHW, grid_BHW2, (True, False))[0]
+        # Torch gives each picture of a batch to one thread: two halves of the channels keep two threads busy.
+        halves = 2 if image_BCHW.shape[1] % 2 == 0 else 1
+        pictures = image_BCHW.reshape(-1, image_BCHW.shape[1] // halves, *image_BCHW.shape[2:])
+        grids = grid_BHW2.repeat_interleave(halves, dim=0)
+        return _sampling_adjoint(pictures, pictures, grids, (True, False))[0].view_as(image_BCHW)
 
     @staticmethod
     @once_differentiable
