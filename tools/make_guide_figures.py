@@ -1,4 +1,4 @@
-"""Figures and the table of docs/guide/simulate.md, from embedded pictures. Run from the top of the checkout."""
+"""Picture, tables and figures of docs/guide/simulate.md, from embedded pictures. Run from the top of the checkout."""
 
 from pathlib import Path
 
@@ -11,8 +11,14 @@ from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Constant
 from turbnet.data.sources import embedded_paths, load_picture
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.optics.psf import psf
+from turbnet.optics.pupil import circular, pupil_grid
+from turbnet.optics.superposition import scatter
+from turbnet.optics.zernike import zernike_basis
+from turbnet.simulate.blur import KERNEL, psf_basis, tilt_free_psf
 from turbnet.simulate.field import ZernikeField
 from turbnet.simulate.simulator import Simulator
+from turbnet.simulate.tilt import upsample
 
 IMAGES = Path("docs/images")
 PAIRS = ((2, 2), (3, 3), (4, 4), (2, 4), (2, 8), (4, 11))
@@ -48,6 +54,40 @@ def covariance_table() -> None:
         print(f"| a{i} a{j} | " + " | ".join(f"{e:+.1f}" for e in np.ravel(error)) + " |")
 
 
+def fine_psfs(coefficients_PN: torch.Tensor, first: int, points: int, size: int) -> torch.Tensor:
+    """PSFs of a_first..a_36 from a pupil of `points` samples across, (P, size, size)."""
+    x, y = pupil_grid(points)
+    modes = torch.from_numpy(zernike_basis(range(first, 37), np.hypot(x, y), np.arctan2(y, x))).float()
+    pupil = torch.from_numpy(circular(points, subsamples=16)).float()
+    parts = [psf(torch.einsum("pn,nyx->pyx", c, modes), pupil, size) for c in coefficients_PN.split(512)]
+    return torch.cat(parts)
+
+
+def picture_error(size: int = 112, edge: int = 24, window: int = 47) -> None:
+    """PSNR of the simulator against dense scatter with whole PSFs, and what a uniform scene does without its division."""
+    scene = torch.from_numpy(load_picture(embedded_paths("test")[0])[100 : 100 + size, 150 : 150 + size, 0].copy())
+    print("\n| D/r0 | 10 components | 20 | 40 | uniform scene flickers by, if undivided | PSF against a finer pupil |")
+    print("|---|---|---|---|---|---|")
+    for strength in (1.0, 2.0, 3.0, 4.5, 6.0):
+        simulator = Simulator(OpticalPath.from_d_over_r0(strength), size, size, margin=0)
+        draw = simulator.draw([0])
+        fine = upsample(draw.coefficients[0], draw.stride, size, size)[0].flatten(1).T
+        whole = fine_psfs(fine, 2, 32, window).view(size, size, window, window)
+        uniform = scatter(torch.ones_like(scene), whole)
+        exact = scatter(scene, whole) / uniform
+        cells = []
+        for components in (10, 20, 40):
+            simulator.basis = psf_basis(components, strength, strength)
+            error = (simulator(scene[None, None, None], draw).frames[0, 0, 0] - exact)[edge:-edge, edge:-edge]
+            cells.append(f"{-10 * torch.log10(error.square().mean()):.1f} dB")
+        flicker = 100 * uniform[edge:-edge, edge:-edge].std()
+        points = fine[::97, 2:]
+        truth = fine_psfs(points, 4, 64, KERNEL)
+        relative = 100 * (tilt_free_psf(points) - truth).norm() / truth.norm()
+        print(f"| {strength} | " + " | ".join(cells) + f" | {flicker:.0f} % | {relative:.1f} % |")
+
+
 if __name__ == "__main__":
     strengths()
     covariance_table()
+    picture_error()

@@ -4,17 +4,16 @@ Every measured quantity has its standard error; a row passes within 5 % (the scr
 whichever is larger, two-sided. Rows without a verdict compare with a formula known to be approximate.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from turbnet.bench import one_point, screen_structure, split_step_speed, two_points
 from turbnet.bench.measurement import Measurement, Panel, table
+from turbnet.progress import progress_bar
 from turbnet.report import Report, Row
 
 SEED = 2026
@@ -53,7 +52,11 @@ def run(quick: bool = False, quiet: bool = False) -> Physics:
     """Measure everything: minutes, or about half a minute if `quick` (a smoke test with wide error bars)."""
     one, two, screens, pairs = (64, 40, 40, 8) if quick else (2400, 800, 1500, 40)
     speed = split_step_speed.measure(pairs, torch.get_num_threads())
-    with _one_thread(), _bars(quiet) as bar:
+    with _one_thread(), progress_bar(quiet) as progress:
+
+        def bar(name: str, count: int) -> Iterator[int]:
+            return iter(progress.track(range(count), count, description=name))
+
         families = [
             screen_structure.measure(screens, SEED),
             one_point.measure(SEED + 1, bar("one point", one // one_point.BATCH)),
@@ -72,21 +75,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-class _bars:
-    """Progress bars on standard error."""
-
-    def __init__(self, quiet: bool) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self.progress = Progress(*columns, console=Console(stderr=True), disable=quiet)
-
-    def __enter__(self) -> Callable[[str, int], Iterator[int]]:
-        self.progress.start()
-        return lambda name, count: iter(self.progress.track(range(count), count, description=name))
-
-    def __exit__(self, *_: object) -> None:
-        self.progress.stop()
 
 
 def draw_figures(panels: list[Panel], folder: Path) -> list[Path]:

@@ -10,6 +10,7 @@
 | none | a folder of PNG files, 000000.png, 000001.png, ... |
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
@@ -208,7 +209,7 @@ class _Gif:
                 self.file.write(b";")
 
 
-class _Video:
+class _Video(ABC):
     """A codec says how its stream is set up and how a picture becomes its frame."""
 
     def __init__(self, path: Path, fps: float, grey: bool) -> None:
@@ -218,11 +219,13 @@ class _Video:
         self.count = 0
         self.stream: Any = None
 
+    @abstractmethod
     def open_stream(self, height: int, width: int) -> Any:
-        raise NotImplementedError
+        """The stream, set up for pictures of this size."""
 
+    @abstractmethod
     def frame(self, pixels: NDArray[np.uint8]) -> av.VideoFrame:
-        raise NotImplementedError
+        """A picture as the codec wants it."""
 
     def write(self, frame: Pixels) -> None:
         self.stream = self.stream or self.open_stream(*frame.shape[:2])

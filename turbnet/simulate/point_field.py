@@ -8,13 +8,11 @@ profile of one's own should be a dataclass, or state its values in another way.
 
 import hashlib
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -23,6 +21,7 @@ from turbnet._version import __version__
 from turbnet.errors import InputError, ParameterError, check_range
 from turbnet.media.atomic import atomic_path
 from turbnet.optics.superposition import scatter
+from turbnet.progress import progress_bar
 from turbnet.simulate.parallel import on_all_cores
 from turbnet.simulate.split_step import SplitStep
 from turbnet.simulate.wavefront import Aperture
@@ -113,8 +112,10 @@ def run_points(
         # A GPU takes one piece at a time, and all of it.
         cores = torch.get_num_threads() if turbulence.phases[0].device.type == "cpu" else 1
         pieces = on_all_cores(propagate, missing, cores)
-        for _ in _tracked(pieces, len(files) - len(missing), len(files), console):
-            pass
+        with progress_bar(quiet) as progress:
+            task = progress.add_task("split-step", total=len(files), completed=len(files) - len(missing))
+            for _ in pieces:
+                progress.advance(task)
     try:
         states = [load_file(file) for file in files]
     except (OSError, SafetensorError) as error:
@@ -150,12 +151,3 @@ def _claim(folder: Path, split_step: SplitStep, request: dict[str, float]) -> No
         raise InputError(
             f"{folder} holds another run ({', '.join(differing)} differ); choose another folder or delete it"
         )
-
-
-def _tracked(pieces: Iterator[None], done: int, total: int, console: Console) -> Iterator[None]:
-    columns = (TextColumn("split-step"), BarColumn(), MofNCompleteColumn(), TextColumn("chunks"), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=console.quiet) as progress:
-        task = progress.add_task("", total=total, completed=done)
-        for piece in pieces:
-            progress.advance(task)
-            yield piece

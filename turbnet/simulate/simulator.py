@@ -9,7 +9,7 @@ what the same atmosphere makes of a uniform scene. Light from a point reaches th
 (scintillation), which the phase-only model leaves out: it gives every point-spread function the sum one. But by
 reciprocity the sum over scene points of what they send to one image point is the energy that would return from there
 through the aperture, which air does not change: a uniform scene looks uniform through any turbulence. Without the
-denominator it would flicker by 10 % at D/r0 = 2 and 19 % at 4.5.
+denominator it would flicker by 11 % at D/r0 = 2 and 19 % at 4.5.
 """
 
 from collections.abc import Callable, Sequence
