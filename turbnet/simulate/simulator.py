@@ -24,7 +24,8 @@ from turbnet.atmosphere.noll import noll_covariance
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import InputError, check_range
 from turbnet.simulate.blur import KERNEL, PSFBasis, blur, blur_weights, psf_basis
-from turbnet.simulate.field import TILT_PIXELS, Draw, ZernikeField
+from turbnet.simulate.draw import TILT_PIXELS, Draw
+from turbnet.simulate.field import ZernikeField
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.tilt import carry, tilt, upsample
 
