@@ -97,6 +97,7 @@ class ZernikeField(nn.Module):
         check_range("outer scale", outer_scale, 1e-2, math.inf, "m")
         check_range("boiling", boiling, 1e-6, math.inf, "s")
         self.path, self.stride, self.margin, self.q, self.boiling = path, stride, margin, q, boiling
+        self.dtype = dtype
         self.pixel = path.pixel * q
         self.rows, self.columns = (1 + -(-(n + 2 * margin - 1) // stride) for n in (height, width))
         self.noll = range(2, modes + 1)
@@ -204,6 +205,8 @@ class ZernikeField(nn.Module):
         d_over_r0: Tensor | None = None,
         start: float = 0,
         cn2: Tensor | None = None,
+        exposures: int = 1,
+        shutter: float = 1.0,
     ) -> Draw:
         """Draw one atmosphere per seed; the same seed gives the same atmosphere, alone or in any batch.
 
@@ -218,15 +221,19 @@ class ZernikeField(nn.Module):
             d_over_r0: strength of each clip, (B,); the path's Cn2 profile is scaled to it. None: as the path says.
             start: number of the first frame: a long clip may be drawn piece by piece.
             cn2: Cn2 of each layer over that of the path, (B, layers), before any scaling to `d_over_r0`.
+            exposures: moments drawn of each frame, evenly over
+            shutter: the part of the frame's time in which it is exposed.
 
         Raises:
             ParameterError: no seeds, no frames, negative strength, a strength asked of a path of still air.
         """
         check_range("number of clips", len(seeds), 1, 2**20)
         check_range("frames", frames, 1, 2**20)
+        check_range("exposures", exposures, 1, 2**16)
+        check_range("shutter", shutter, 0, 1)
         gain = self._gain(len(seeds), d_over_r0)
         if not bool(gain.any()):
-            shape = (len(seeds), frames, len(self.noll), self.rows, self.columns)
+            shape = (len(seeds), frames * exposures, len(self.noll), self.rows, self.columns)
             return Draw(gain.new_zeros(shape), self.stride, self.margin, self.q)
         layers = len(self._layer_scale)
         still = self._layer_scale.new_zeros(layers, 2)
@@ -234,10 +241,10 @@ class ZernikeField(nn.Module):
         for index, seed in enumerate(seeds):
             strength = None if cn2 is None else cn2[index].to(self._mirrored)
             drawn = []
-            for frame in range(frames):
-                number = start + frame
+            for moment in range(frames * exposures):
+                number = start + moment // exposures + shutter * (moment % exposures) / exposures
                 if wind is None:
-                    noise, travel = self._noise(seed, int(number)), still
+                    noise, travel = self._noise(seed, int(start) * exposures + moment), still
                 else:
                     time = number / frame_rate
                     noise = self._noise_at(seed, time)
