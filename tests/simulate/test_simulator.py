@@ -4,8 +4,7 @@ import torch
 
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Constant
-from turbnet.errors import InputError, ParameterError
-from turbnet.simulate.sensor import Sensor
+from turbnet.errors import InputError
 from turbnet.simulate.simulator import Simulator
 
 
@@ -107,32 +106,3 @@ def test_wrong_size_and_bad_pixels_are_refused(simulator, scene):
     bad[0, 0, 0, 3, 3] = float("nan")
     with pytest.raises(InputError, match="NaN"):
         simulator(bad, draw)
-
-
-class TestSensor:
-    def test_ideal_sensor_changes_nothing(self):
-        x = torch.rand(2, 3, 8, 8) * 3 - 1
-        assert torch.equal(Sensor()(x), x)
-
-    def test_noise_has_the_variance_it_says(self):
-        x = torch.full((400, 400), 0.4)
-        noise = Sensor(full_well=1000.0, read_noise=0.02)(x, seed=1) - x
-        expected = 0.4 / 1000 + 0.02**2
-        # The variance of n samples has the relative error sqrt(2/n).
-        assert float(noise.var()) == pytest.approx(expected, rel=4 * (2 / x.numel()) ** 0.5)
-        assert abs(float(noise.mean())) < 4 * (expected / x.numel()) ** 0.5
-
-    def test_depth(self):
-        out = Sensor(bits=3)(torch.rand(1000))
-        assert len(out.unique()) == 8
-
-    def test_rounding_and_noise_pass_gradients(self):
-        x = torch.zeros(10, requires_grad=True)
-        Sensor(100.0, 0.0, 8)(x + 0.5).sum().backward()
-        assert torch.isfinite(x.grad).all()
-        assert x.grad.abs().min() > 0
-
-    @pytest.mark.parametrize("bad", [{"full_well": 0.0}, {"read_noise": -0.1}, {"bits": 99}])
-    def test_out_of_range(self, bad):
-        with pytest.raises(ParameterError, match=next(iter(bad))):
-            Sensor(**bad)
