@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -79,7 +79,7 @@ class PairMaker(nn.Module):
         return Pair(to_srgb(frames.clamp(0, 1)), scene_BTCHW, to_srgb(blur_only.clamp(0, 1)), tilt)
 
     def _clip(self, scene_1TCHW: Tensor, seen_through: Conditions) -> tuple[Tensor, Tensor, Tensor]:
-        simulator = self.simulators[seen_through.geometry]
+        simulator = cast(Simulator, self.simulators[seen_through.geometry])
         wind = None if seen_through.wind is None else torch.tensor(seen_through.wind)
         strength = torch.tensor([seen_through.d_over_r0])
         draw = simulator.draw(
