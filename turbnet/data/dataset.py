@@ -8,10 +8,14 @@ is made by one process on one thread, and its number decides everything about it
 import hashlib
 import json
 import math
+import os
 import re
+import threading
+import time
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +92,12 @@ def write_dataset(
             "ignore", message="This DataLoader will create"
         )  # more workers than cores: the user's say
         loader = DataLoader(
-            _Samples(scenes, maker), batch_size=None, sampler=indices, num_workers=workers, collate_fn=_as_it_is
+            _Samples(scenes, maker),
+            batch_size=None,
+            sampler=indices,
+            num_workers=workers,
+            collate_fn=_as_it_is,
+            worker_init_fn=partial(_end_with, os.getpid()),
         )
     try:
         with _one_thread(), progress_bar(quiet) as progress:
@@ -178,6 +187,17 @@ class _Samples(Dataset[Sample | InputError]):
 def _as_it_is(sample: Any) -> Any:
     """NumPy arrays stay so and travel through a pipe: shared memory is scarce in containers."""
     return sample
+
+
+def _end_with(parent: int, worker: int) -> None:
+    """End a worker soon after its parent was killed, even while it waits to hand over a sample that nobody will take."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _made(sample: Sample | InputError) -> Sample:
