@@ -85,9 +85,11 @@ def quality(network: torch.nn.Module, source: Source, strength: float) -> str:
     """PSNR of input, temporal mean and restored frames on held-out clips, dB."""
     clips = CleanClips(source, CLIPS, FRAMES, SIZE, SIZE, seed=777)
     maker = PairMaker(
-        *(SIZE, SIZE, (strength, strength)),
+        SIZE,
+        SIZE,
+        d_over_r0=strength,
         independent=1.0,
-        read_noise=(0.01, 0.01),
+        read_noise=0.01,
         stride=4,
         components=20,
         margin=None,

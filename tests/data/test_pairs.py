@@ -97,6 +97,28 @@ def test_strengths_span_their_range(scene):
     assert max(spread) > 3 * min(spread)
 
 
+def test_each_clip_is_seen_through_the_geometry_of_its_conditions(scene):
+    several = PairMaker(32, 32, d_over_r0=3.0, distance=(1000, 16_000), geometries=2, independent=1.0, **SMALL)
+    assert len(several.simulators) == 2
+    seeds = [next(s for s in range(99) if several.conditions(s).geometry == wanted) for wanted in (0, 1)]
+    for geometry, seed in enumerate(seeds):
+        path = several.ranges.paths()[geometry]
+        alone = PairMaker(32, 32, d_over_r0=3.0, distance=path.distance, independent=1.0, **SMALL)
+        batch = several(scene[..., :32, :32].expand(2, -1, -1, -1, -1), seeds)
+        expected = alone(scene[..., :32, :32], [seed])
+        # Conditions are drawn alike but for the geometry, which alone has only one of.
+        torch.testing.assert_close(batch.tilt[geometry], expected.tilt[0], rtol=0, atol=1e-4)
+        assert not torch.allclose(batch.tilt[geometry], several(scene[..., :32, :32], [seeds[1 - geometry]]).tilt[0])
+
+
+def test_the_conditions_of_a_seed_are_those_it_is_seen_through(scene):
+    maker = PairMaker(32, 32, d_over_r0=(1.0, 4.0), independent=1.0, **SMALL, **SILENT)
+    conditions = maker.conditions(5)
+    draw = maker.simulators[0].draw([conditions.draw_seed], 4, d_over_r0=torch.tensor([conditions.d_over_r0]))
+    seen = maker.simulators[0](to_linear(scene[..., :32, :32]), draw.centred())
+    assert torch.equal(maker(scene[..., :32, :32], [5]).tilt, seen.tilt)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -113,8 +135,12 @@ def test_strengths_span_their_range(scene):
         ("aperture", -1.0),
         ("distance", 0.0),
         ("wavelength", 0.0),
+        ("geometries", 3),
         ("modes", 1),
+        ("modes", "many"),
+        ("stride", 1.5),
         ("components", -1),
+        ("margin", "wide"),
     ],
 )
 def test_out_of_range(name, value):

@@ -148,6 +148,17 @@ def test_resume(command, first):
     assert steps == {2, 3}
 
 
+def test_several_geometries(command):
+    wide = [*SECONDS[1:], "simulator=wide", "simulator.geometries=2", "simulator.modes=10", "simulator.components=2"]
+    code, _, err = command(*wide, "output=wide")
+    assert code == 0, err
+    known = torch.load("wide/checkpoints/last.ckpt", weights_only=True)["hyper_parameters"]["simulator"]
+    assert known["geometries"] == 2
+    assert known["distance"] == [2000, 6000]
+    refused(command(*wide, "simulator.aperture=[0.3,0.1]"), "aperture", "must be a range")
+    refused(command(*wide, "simulator.modes=many"), "modes", "whole number")
+
+
 def test_two_stages(command):
     code, _, err = command("experiment=tiny_tilt", *SECONDS[1:], "output=one")
     assert code == 0, err

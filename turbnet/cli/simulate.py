@@ -34,10 +34,10 @@ def simulate(
     json: Annotated[Path | None, typer.Option(help="Write the path's figures as JSON.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no table.")] = False,
 ) -> None:
-    """Look at a picture or a clip through turbulent air.
+    """Look at a picture or a clip through turbulent air; with --dataset OUT, write many pairs to train on instead.
 
     A pixel of the input is taken as the Nyquist pixel lambda L / (2 D) of the path. Give the strength by --cn2 or by
-    --d-over-r0; without either, Cn2 is 1e-15 m^(-2/3).
+    --d-over-r0; without either, Cn2 is 1e-15 m^(-2/3). `turbnet simulate --dataset OUT --help` tells of datasets.
     """
     from turbnet.atmosphere.path import OpticalPath
     from turbnet.atmosphere.profiles import Constant
@@ -84,4 +84,8 @@ def simulate(
 
 def main(arguments: list[str]) -> int:
     """Run the verb."""
+    if any(argument.partition("=")[0] == "--dataset" for argument in arguments):
+        from turbnet.cli import dataset
+
+        return dataset.main(arguments)
     return run_typed(simulate, arguments, "simulate")
