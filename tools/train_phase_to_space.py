@@ -130,7 +130,8 @@ def main() -> None:
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     table = "\n".join(
-        f"| {r['d_over_r0']:g} | {r['median']:.2%} | {r['95 %']:.2%} | {r['median of the mean PSF']:.1%} |" for r in rows
+        f"| {r['d_over_r0']:g} | {r['median']:.2%} | {r['95 %']:.2%} | {r['median of the mean PSF']:.1%} |"
+        for r in rows
     )
     facts = "\n".join(f"| {k} | {v} |" for k, v in card.items() if not isinstance(v, list))
     text = (

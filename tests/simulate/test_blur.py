@@ -3,7 +3,10 @@ import torch
 from scipy.special import j1
 
 from turbnet.errors import ParameterError
-from turbnet.simulate.blur import KERNEL, blur, blur_weights, psf_basis, tilt_free_psf
+from turbnet.simulate.blur import blur, blur_weights
+from turbnet.simulate.psf_basis import kernel_size, psf_basis, tilt_free_psf
+
+KERNEL = kernel_size()
 
 HALF = KERNEL // 2
 

@@ -15,9 +15,10 @@ from turbnet.optics.psf import convolve, psf
 from turbnet.optics.pupil import circular, pupil_grid
 from turbnet.optics.superposition import gather, scatter, scatter_basis
 from turbnet.optics.zernike import zernike_basis
-from turbnet.simulate.blur import blur, blur_weights, psf_basis
+from turbnet.simulate.blur import blur, blur_weights
 from turbnet.simulate.draw import TILT_PIXELS
 from turbnet.simulate.field import ZernikeField
+from turbnet.simulate.psf_basis import psf_basis
 from turbnet.simulate.simulator import Simulator
 from turbnet.simulate.tilt import carry, tilt, upsample
 

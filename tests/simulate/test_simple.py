@@ -13,8 +13,9 @@ from turbnet.atmosphere.screens import PhaseScreen
 from turbnet.errors import InputError, ParameterError
 from turbnet.optics.psf import psf
 from turbnet.optics.pupil import circular, pupil_grid
-from turbnet.simulate.blur import tilt_free_psf
-from turbnet.simulate.field import TILT_PIXELS, ZernikeField
+from turbnet.simulate.draw import TILT_PIXELS
+from turbnet.simulate.field import ZernikeField
+from turbnet.simulate.psf_basis import tilt_free_psf
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.simple import (
     DirectToImage,

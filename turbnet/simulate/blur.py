@@ -64,7 +64,15 @@ def blur(image_BCHW: Tensor, weights_BMhw: Tensor, basis: PSFBasis, stride: int,
     rows = []
     for top in range(0, height, step):
         pieces = [
-            _piece(image_BCHW, weights_BMhw, basis, stride, factor, (top, min(top + step, height)), (left, min(left + step, width)))
+            _piece(
+                image_BCHW,
+                weights_BMhw,
+                basis,
+                stride,
+                factor,
+                (top, min(top + step, height)),
+                (left, min(left + step, width)),
+            )
             for left in range(0, width, step)
         ]
         rows.append(torch.cat(pieces, dim=-1))
@@ -95,12 +103,15 @@ def _piece(
     beta = _fine_weights(weights_BMhw, stride, factor, offset, size)
     blurred = _Scatter.apply(padded, beta, *basis.transfer(size, image.dtype, factor), factor)
     top, left = rows[0] - offset[0], columns[0] - offset[1]
-    return blurred[..., top : top + rows[1] - rows[0], left : left + columns[1] - columns[0]]  # type: ignore[no-any-return]
+    cut: Tensor = blurred[..., top : top + rows[1] - rows[0], left : left + columns[1] - columns[0]]
+    return cut
 
 
 def _fine_weights(weights_BMhw: Tensor, stride: int, factor: int, offset: list[int], size: list[int]) -> Tensor:
     """beta on every `factor`-th pixel of a piece that begins at `offset`, zero where the grid does not reach."""
     context = 3  # grid points that bicubic interpolation looks beyond the piece
+    if weights_BMhw.shape[1] == 0:
+        return weights_BMhw
     starts, cut = [], weights_BMhw
     for axis, (first, count) in enumerate(zip(offset, size, strict=True)):
         have = weights_BMhw.shape[2 + axis]

@@ -405,7 +405,7 @@ def _tilt_variance(path: OpticalPath, z: Array, cn2_dz: Array, k0: float) -> Arr
     edges = np.linspace(0, 100 ** (1 / 3), 101)
     half = 0.5 * np.diff(edges)[:, None]
     t = (edges[:-1, None] + half * (gauss + 1)).ravel()
-    x, dx = t**3, (half * weight).ravel() * 3 * t**2  # x = kappa c R = t^3 is smooth at 0
+    x, dx = np.asarray(t**3, dtype=np.float64), (half * weight).ravel() * 3 * t**2  # x = kappa c R = t^3 is smooth at 0
     reach = (1 - z / path.distance) * path.aperture / 2
     kappa = x / reach[:, None]
     spectrum = 2 * np.pi * path.wavenumber**2 * 0.033 * cn2_dz[:, None] * (kappa**2 + k0**2) ** (-11 / 6)

@@ -54,7 +54,9 @@ class Region:
     def of(self, picture: Tensor, step: int = 1) -> Tensor:
         """The part of a picture (..., H, W), or of a grid of every `step`-th pixel."""
         (top, bottom), (left, right) = self.rows, self.columns
-        return picture[..., top // step : -(-bottom // step) + (step > 1), left // step : -(-right // step) + (step > 1)]
+        return picture[
+            ..., top // step : -(-bottom // step) + (step > 1), left // step : -(-right // step) + (step > 1)
+        ]
 
     def grown(self, reach: int, step: int, within: Tensor) -> "Region":
         """With `reach` pixels more on each side, beginning at a multiple of `step`, inside a picture (..., H, W)."""

@@ -28,7 +28,7 @@ from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Array
 from turbnet.errors import ParameterError, check_range
 from turbnet.optics.zernike import noll_to_nm
-from turbnet.simulate.field import Draw
+from turbnet.simulate.draw import Draw
 from turbnet.simulate.white import white_noise
 
 _RADII = 200  # at which a mode's covariance is integrated; a spline in asinh(r) holds the rest

@@ -37,7 +37,7 @@ _ODD = [j - 4 for j in range(4, MODES + 1) if noll_to_nm(j)[0] % 2]
 
 
 class PhaseToSpace(nn.Module):
-    """Tilt-free PSFs of a_4..a_36 at Nyquist pixels, as the cubature of the aperture alone gives them until it is trained."""
+    """Tilt-free PSFs of a_4..a_36 at Nyquist pixels; until it is trained, as the cubature of the aperture gives them."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -99,15 +99,16 @@ class Plan:
         if not self.blur:
             kernel = "no blur"
         lines = [
-            f"budget {self.tolerance:g} dB, expected {self.expected:.1f} dB; {100 * self.saved:.0f} % of the arithmetic saved",
+            f"budget {self.tolerance:g} dB, expected {self.expected:.1f} dB; {100 * self.saved:.0f} % of the work saved",
             f"  modes        2..{self.modes}",
             f"  tilt         {'yes' if self.tilt else 'left out'}",
             f"  blur         {kernel}",
         ]
         if self.blur and self.components:
             how = "phase-to-space network" if self.network else f"exact, {self.points} samples across the aperture"
+            where = "every point" if self.grid == 1 else "every second point"
             lines += [
-                f"  weights      {how}, on every {'point' if self.grid == 1 else f'{self.grid}nd point'} of the field's grid",
+                f"  weights      {how}, {where} of the field's grid",
                 f"  components   summed at {'full' if self.factor == 1 else 'half'} resolution",
             ]
         lines.append(f"  wavelengths  {self.wavelengths}")
@@ -257,9 +258,7 @@ class Planner:
         error = self._energy * float((between - weights)[..., 4:-4, 4:-4].square().sum(1).mean())
         return (2, error) if error <= budget else (1, 0.0)
 
-    def _components(
-        self, basis: PSFBasis, budget: float, wanted: int | None, exact: bool
-    ) -> tuple[int, int, float]:
+    def _components(self, basis: PSFBasis, budget: float, wanted: int | None, exact: bool) -> tuple[int, int, float]:
         """Resolution and number of components of least work."""
         variance = basis.variance.double()
         beyond = basis.left + torch.cat((variance.flip(0).cumsum(0).flip(0), variance.new_zeros(1)))

@@ -32,8 +32,9 @@ from turbnet.atmosphere.exposure import tilt_free_otf
 from turbnet.atmosphere.noll import noll_covariance, noll_matrix
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import InputError, check_range
-from turbnet.simulate.blur import tilt_free_psf
-from turbnet.simulate.field import TILT_PIXELS, ZernikeField
+from turbnet.simulate.draw import TILT_PIXELS
+from turbnet.simulate.field import ZernikeField
+from turbnet.simulate.psf_basis import tilt_free_psf
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.tilt import tilt, upsample
 from turbnet.simulate.white import white_noise

@@ -52,7 +52,7 @@ class Waves:
         weight = np.ones_like(self.x)
         reach = np.maximum(np.abs(self.x) / self.step[0], np.abs(self.y) / self.step[1]) / self.width
         near = (reach > 0) & (reach < _NEAR + 0.5)
-        step = tuple(self.width[near] * s for s in self.step)
+        step = (self.width[near] * self.step[0], self.width[near] * self.step[1])
         weight[near] = cell_weight(self.x[near], self.y[near], step, k0)
         weight[reach == 0] = 0.0
         return weight
