@@ -57,7 +57,7 @@ class Fit:
     """The strength of a clip's turbulence and what it rests on.
 
     Attributes:
-        d_over_r0: D/r0, spherical wave.
+        d_over_r0: D/r0, spherical wave; `WEAKEST` stands for that or less.
         uncertainty: its standard error: sampling of clip and simulation, and `CALIBRATION`.
         tilt_pixels: measured displacement that differs across the picture, rms an axis, pixels.
         points: windows that had texture enough to be registered.
@@ -82,18 +82,18 @@ def fit_strength(frames: Tensor, path: OpticalPath) -> Fit:
         path: geometry, wavelength and shape of the Cn2 profile; its strength is not used.
 
     Raises:
-        InputError: too few frames, NaN or infinite values, values outside [0, 1], too little texture to register, or
-            motion beyond what D/r0 = 10 explains.
-        ParameterError: the path is one of still air, which has no profile to scale.
+        InputError: too few or too small frames, NaN or infinite values, values outside [0, 1], too little texture to
+            register, motion beyond what D/r0 = 10 or the frames' width explains, or a path of still air, which has no
+            profile to scale.
     """
+    if path.d_over_r0 == 0:
+        raise InputError("a path of still air has no profile to scale to a strength; give it a Cn2 above 0")
     clip = _check(frames)
     with torch.no_grad():
         reference, common = _align(clip)
-        points = _textured(reference, _noise(clip))
-        shifts, _ = _track(clip, reference, points, common)
-        reference = _register(clip, shifts, points).mean(0)
+        points = _textured(reference, common, _noise(clip))
         weights = _weights(points, path)
-        shifts, residual = _track(clip, reference, points, common)
+        shifts, reference, residual = _measure(clip, reference, points, common)
         seen = _energies(shifts, weights)
 
         strength = min(max(float(seen.mean()) ** 0.6, WEAKEST), STRONGEST)
@@ -154,9 +154,7 @@ def _align(clip_THW: Tensor) -> tuple[Tensor, Tensor]:
     reference = clip_THW[len(clip_THW) // 2]
     for _ in range(2):
         common = _whole_shift(clip_THW, reference)
-        rolled = [
-            torch.roll(frame, (-int(y), -int(x)), (0, 1)) for frame, (x, y) in zip(clip_THW, common, strict=True)
-        ]
+        rolled = [torch.roll(frame, (-int(y), -int(x)), (0, 1)) for frame, (x, y) in zip(clip_THW, common, strict=True)]
         reference = torch.stack(rolled).mean(0)
     return reference, _whole_shift(clip_THW, reference)
 
@@ -202,13 +200,19 @@ def _gradients(reference_HW: Tensor, points_P2: Tensor) -> tuple[Tensor, Tensor]
     return gradient, torch.einsum("pan,pbn,n->pab", gradient, gradient, weight)
 
 
-def _textured(reference_HW: Tensor, noise: float) -> Tensor:
-    """Points (P, 2), x then y, on a grid, at which noise shifts a window by less than `_TEXTURE` in any direction."""
-    height, width = reference_HW.shape
-    area = (height - 2 * _BORDER) * (width - 2 * _BORDER)
-    spacing = max(_SPACING, int(np.ceil((area / _MOST_POINTS) ** 0.5)))
-    rows, columns = (
-        torch.arange(_BORDER + (n - 1 - 2 * _BORDER) % spacing // 2, n - _BORDER, spacing) for n in (height, width)
+def _textured(reference_HW: Tensor, common_T2: Tensor, noise: float) -> Tensor:
+    """Points (P, 2), x then y, of a grid whose windows lie in every frame and are shifted by noise less than `_TEXTURE`."""
+    first = _BORDER - common_T2.amin(0).clamp(max=0).int()
+    last = torch.tensor(reference_HW.shape).flip(0) - 1 - _BORDER - common_T2.amax(0).clamp(min=0).int()
+    width, height = (last - first).tolist()
+    if min(width, height) < 0:
+        raise InputError(
+            "the camera moves by so much that the frames share too little of the scene; steady the clip first"
+        )
+    spacing = max(_SPACING, int(np.ceil((width * height / _MOST_POINTS) ** 0.5)))
+    columns, rows = (
+        int(start) + n % spacing // 2 + torch.arange(0, n + 1 - n % spacing // 2, spacing)
+        for start, n in zip(first, (width, height), strict=True)
     )
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     points = torch.stack((x.flatten(), y.flatten()), -1).float()
@@ -222,6 +226,14 @@ def _textured(reference_HW: Tensor, noise: float) -> Tensor:
             f"{FEWEST_POINTS} are needed; choose a part with more detail"
         )
     return points
+
+
+def _measure(clip_THW: Tensor, first_HW: Tensor, points_P2: Tensor, common_T2: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Shifts (T, P, 2) from the mean of the frames registered to a first reference; that mean; rms difference left."""
+    shifts, _ = _track(clip_THW, first_HW, points_P2, common_T2)
+    reference = _register(clip_THW, shifts, points_P2).mean(0)
+    shifts, left = _track(clip_THW, reference, points_P2, shifts.mean(1))
+    return shifts, reference, left
 
 
 def _track(clip_THW: Tensor, reference_HW: Tensor, points_P2: Tensor, common_T2: Tensor) -> tuple[Tensor, float]:
@@ -267,8 +279,7 @@ def _relative(shifts_TP2: Tensor) -> Tensor:
 def _weights(points_P2: Tensor, path: OpticalPath) -> Tensor:
     """W of x and y, (2, P, P), such that true tilts at D/r0 = 1 give S = 1."""
     x, y = (points_P2.double().numpy() * path.pixel).T
-    still = path.d_over_r0 == 0
-    unit = TILT_PIXELS**2 * (1.0 if still else path.d_over_r0 ** (-5 / 3))
+    unit = TILT_PIXELS**2 * path.d_over_r0 ** (-5 / 3)
     out, total = [], 0.0
     for mode in (2, 3):
         full = unit * zernike_covariance(path, mode, mode, x[:, None] - x, y[:, None] - y, path.layers(32))
@@ -297,18 +308,20 @@ def _relative_error(energies_T: Tensor) -> float:
 
 def _simulator(path: OpticalPath, reference_HW: Tensor, strength: float, noise: float) -> Simulator:
     strengths = max(strength / 1.5, WEAKEST), min(2 * strength, STRONGEST)
-    return Simulator(path, *reference_HW.shape, components=10, strengths=strengths, sensor=Sensor(read_noise=noise))
+    height, width = reference_HW.shape
+    return Simulator(path, height, width, components=10, strengths=strengths, sensor=Sensor(read_noise=noise))
 
 
 def _simulate(simulator: Simulator, reference_HW: Tensor, strength: float, points_P2: Tensor) -> tuple[Tensor, float]:
-    """`_track` on independent frames of the same scene, the same ones but for their strength at every call."""
+    """Shifts and rms difference left of independent frames of the same scene, whose seeds are the same at every call."""
     scene = _sharpen(reference_HW, strength)
     frames = []
     for seed in range(_SIMULATED):
         draw = simulator.draw([seed], d_over_r0=torch.tensor([strength]))
         frames.append(simulator(scene[None, None, None], draw, noise_seed=seed).frames[0, 0, 0])
     clip = torch.stack(frames)
-    return _track(clip, reference_HW, points_P2, _whole_shift(clip, reference_HW))
+    shifts, _, left = _measure(clip, reference_HW, points_P2, _whole_shift(clip, reference_HW))
+    return shifts, left
 
 
 def _sharpen(reference_HW: Tensor, strength: float) -> Tensor:
@@ -317,7 +330,7 @@ def _sharpen(reference_HW: Tensor, strength: float) -> Tensor:
     padded = F.pad(reference_HW[None, None], (margin,) * 4, mode="reflect")[0, 0]
     height, width = padded.shape
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)) * 2  # the cutoff is at 1/2 a pixel
-    radii = np.linspace(0, 1, 65)
+    radii = np.linspace(0, 1, 33)
     otf = torch.from_numpy(np.interp(frequency, radii, tilt_free_otf(radii, strength))).float()
     sharp = torch.fft.irfft2(torch.fft.rfft2(padded) * otf / (otf**2 + 1e-2), s=(height, width))
     return sharp[margin:-margin, margin:-margin]
