@@ -1,10 +1,12 @@
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 import skimage.data
 import torch
 
+from turbnet.atmosphere.exposure import tilt_free_otf
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.atmosphere.profiles import Constant
 from turbnet.errors import InputError
@@ -92,10 +94,6 @@ def test_noise_is_found_in_spite_of_texture(clip):
 
 def test_sharpening_undoes_the_mean_blur():
     """A picture of low frequencies, blurred by the transfer function, comes back."""
-    import numpy as np
-
-    from turbnet.atmosphere.exposure import tilt_free_otf
-
     x = torch.arange(128.0)
     wave = 0.5 + 0.3 * torch.cos(2 * torch.pi * x / 16).expand(128, -1)
     blurred = 0.5 + float(tilt_free_otf(np.array(2 / 16), 2.0)) * (wave - 0.5)
