@@ -9,7 +9,7 @@ each frame and in time,
 
 where C is the exact covariance of d (`turbnet.atmosphere.covariance`) at D/r0 = 1. The weights W are those of least
 squares for displacements measured with errors as large as themselves. They lower the share of the widest patterns, which
-are few and change slowly: in wind the scatter of D/r0 falls from 5 to 2 %.
+are few and change slowly: in wind the scatter of D/r0 falls from 5 to 2 or 3 %.
 
 True tilts would give S proportional to (D/r0)^(5/3). Those measured in windows differ, by blur, averaging and noise, by
 an amount that depends on the scene. So frames are simulated from the scene itself, which is the registered mean of the
