@@ -382,7 +382,7 @@ class _RadialTable:
 
     def __init__(self, top: int, dtype: torch.dtype) -> None:
         self._step = 1 / 128
-        x = np.arange(int(_REACH / self._step) + 2) * self._step
+        x = np.asarray(np.arange(int(_REACH / self._step) + 2) * self._step, dtype=np.float64)
         table = np.stack([np.zeros_like(x)] + [fourier_radial(order, x) for order in range(1, top + 1)])
         table[:, -2:] = 0.0
         self._table = torch.from_numpy(table).to(dtype)

@@ -28,7 +28,7 @@ from turbnet.atmosphere.covariance import zernike_covariance
 from turbnet.atmosphere.exposure import tilt_free_otf
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import InputError
-from turbnet.simulate.field import TILT_PIXELS
+from turbnet.simulate.draw import TILT_PIXELS
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.simulator import Simulator
 from turbnet.simulate.tilt import sample, upsample

@@ -12,7 +12,7 @@ from turbnet.simulate.blur import blur, blur_weights
 from turbnet.simulate.phase_to_space import PhaseToSpace
 from turbnet.simulate.plan import Plan
 from turbnet.simulate.psf_basis import PSFBasis
-from turbnet.simulate.tilt import carry, tilt
+from turbnet.simulate.tilt import carry, splat
 
 FLAT = 1e-6
 """A scene whose neighbours differ by less is flat."""
@@ -95,6 +95,7 @@ class Look:
     Args:
         padded_BCHW: scene with its margin, linear intensities.
         tilt_B2hw: on the grid of `stride` pixels, pixels.
+        shift_B2HW: the same at every pixel.
         high_BNhw: a_4..a_J on it, rad.
         stride: pixels.
         plan: what to do and what to leave out.
@@ -107,6 +108,7 @@ class Look:
         self,
         padded_BCHW: Tensor,
         tilt_B2hw: Tensor,
+        shift_B2HW: Tensor,
         high_BNhw: Tensor,
         stride: int,
         plan: Plan,
@@ -114,7 +116,8 @@ class Look:
         network: PhaseToSpace | None,
         uniform: bool,
     ) -> None:
-        self.tilts, self.high, self.stride, self.plan, self.uniform = tilt_B2hw, high_BNhw, stride, plan, uniform
+        self.tilts, self.shift, self.high, self.stride = tilt_B2hw, shift_B2HW, high_BNhw, stride
+        self.plan, self.uniform = plan, uniform
         self.colours, self.network = colours, network
         scenes = [padded_BCHW[:, colour.channels] for colour in colours]
         if uniform:  # a uniform scene comes along as one more channel
@@ -125,7 +128,7 @@ class Look:
     def _moved(self) -> list[Tensor]:
         if not self.plan.tilt:
             return self.scenes
-        return [tilt(scene, self.tilts, self.stride) for scene in self.scenes]
+        return [splat(scene, self.shift) for scene in self.scenes]
 
     @cached_property
     def _weights(self) -> list[Tensor]:

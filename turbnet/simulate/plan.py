@@ -4,13 +4,16 @@ An approximation that changes PSFs by delta changes a picture with the power spe
 
 .. math:: A\, E\|\delta\|^2, \qquad \|\delta\|^2 = \sum_f |\hat\delta(f)|^2 / f^2, \qquad A \approx 0.1\, E|\nabla J|^2
 
-(`turbnet.simulate.psf_basis.in_metric`; the factor, 0.05 to 0.15 over the pictures inside scikit-image, is 1 / (2 pi)^2
-for gradients of the band-limited picture and more for differences of pixels). Every candidate's delta is measured on the
-path's own PSFs; the cheapest that fit the budget together are taken.
+(`turbnet.simulate.psf_basis.in_metric`). The pictures inside scikit-image have 0.1 to 1.7, mostly 1, times this power
+between 1/32 and 1/5 cycles a pixel, and 0.1 to 0.55 times beyond 1/4, which counts for half therefore. Every candidate's
+delta is measured on the path's own PSFs; the cheapest that fit the budget together are taken.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -18,9 +21,8 @@ from torch import Tensor
 from turbnet.atmosphere.noll import noll_covariance
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import check_range
-from turbnet.optics.zernike import noll_to_nm
 from turbnet.simulate.blur import blur_weights
-from turbnet.simulate.draw import TILT_PIXELS
+from turbnet.simulate.draw import TILT_PIXELS, Draw
 from turbnet.simulate.field import ZernikeField
 from turbnet.simulate.phase_to_space import MODES, released
 from turbnet.simulate.psf_basis import (
@@ -41,6 +43,8 @@ CONTRAST = 0.1
 """Root-mean-square gradient of a picture a pixel, linear intensities; photographs have 0.05 to 0.12, print 0.17."""
 
 _SPECTRUM = 0.1  # A over the mean square of the gradient
+_FINE = 0.5  # of that power, what pictures have beyond 1/4 cycle a pixel
+_CROSSING = 0.25  # fits what dense scatter shows at D/r0 = 3, 4.5 and 6
 _RESERVE = 2.0  # dB kept in hand: a frame's own atmosphere is not the average one
 _SAMPLES = 300
 _FINE_PUPIL = 24
@@ -64,7 +68,7 @@ class Plan:
         tilt: False where points move too little to see.
         wavelengths: how many are simulated.
         errors: expected mean-square error of the frame by approximation.
-        work: arithmetic of a frame by stage, GFLOP, of this plan and of the same without any saving.
+        work: estimated time of a frame by stage, ms, of this plan and of the same without any saving.
         notes: what the scene lets out besides.
     """
 
@@ -83,14 +87,18 @@ class Plan:
     notes: tuple[str, ...] = ()
 
     @property
+    def added(self) -> float:
+        """Mean-square error of all approximations together."""
+        return sum(error for _, error in self.errors)
+
+    @property
     def expected(self) -> float:
         """PSNR expected of the whole, dB."""
-        total = sum(error for _, error in self.errors)
-        return math.inf if total == 0 else -10 * math.log10(total)
+        return math.inf if self.added == 0 else -10 * math.log10(self.added)
 
     @property
     def saved(self) -> float:
-        """Part of the arithmetic that is left out."""
+        """Part of the work that is left out."""
         full = sum(full for _, _, full in self.work)
         return 1 - sum(own for _, own, _ in self.work) / full if full else 0.0
 
@@ -113,7 +121,7 @@ class Plan:
             ]
         lines.append(f"  wavelengths  {self.wavelengths}")
         lines += [f"  error of {name:24s}{_decibel(error)}" for name, error in self.errors]
-        lines += [f"  work of {name:10s}{own:8.3f} of {full:8.3f} GFLOP" for name, own, full in self.work]
+        lines += [f"  work of {name:10s}{own:8.1f} of {full:8.1f} ms" for name, own, full in self.work]
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
 
@@ -197,15 +205,39 @@ class Planner:
             modes, cut = self._modes(0.05 * budget)
             errors.append(("modes left out", cut))
         basis = psf_basis(min(MOST, self.exact[0].numel() - 1), *self.strengths, max(modes, 4), self.q, points)
-        network, weights = (False, 0.0) if exact else self._network(basis, points, modes, 0.15 * budget)
-        grid, coarse = (1, 0.0) if exact or components == 0 else self._grid(basis, modes, 0.1 * budget)
-        left = budget - sum(error for _, error in errors) - weights - coarse
-        factor, count, residue = self._components(basis, left, components, exact)
-        if count == 0:
-            network, weights, grid, coarse = False, 0.0, 1, 0.0
-        errors += [("the network", weights), ("the weights' grid", coarse), ("components left out", residue)]
-        plan = Plan(tolerance, modes, True, count, points, network, grid, factor, tilt, errors=tuple(errors))
-        return self._with_work(plan)
+        errors.append(("neighbours that cross", self._crossing_error(basis)))
+        start = Plan(tolerance, modes, True, 0, points, False, tilt=tilt, errors=tuple(errors))
+        candidates = [
+            (plan, sum(self._work(plan).values())) for plan in self._candidates(start, basis, components, exact)
+        ]
+        fitting = [(plan, work) for plan, work in candidates if plan.added <= budget]
+        if fitting:
+            best, _ = min(fitting, key=lambda pair: pair[1])
+        else:
+            best, _ = min(candidates, key=lambda pair: pair[0].added)
+        return self._with_work(best)
+
+    def _candidates(self, start: Plan, basis: PSFBasis, components: int | None, exact: bool) -> Iterator[Plan]:
+        """Every way to find the weights and to sum the components, with the error it adds."""
+        variance = basis.variance.double()
+        beyond = basis.left + torch.cat((variance.flip(0).cumsum(0).flip(0), variance.new_zeros(1)))
+        above = torch.cat((variance.new_zeros(1), (variance * self._above_half(basis)).cumsum(0)))
+        network = math.inf if exact else self._network_error(basis, start.modes)
+        coarse = math.inf if exact or components == 0 else self._grid_error(basis, start.modes)
+        counts = (0, *(m for m in _COMPONENTS if m <= len(variance))) if components is None else (components,)
+        for count, learned, grid, factor in product(counts, (True, False), (1, 2), (1, 2)):
+            added = [
+                ("the network", network if learned else 0.0),
+                ("the weights' grid", coarse if grid == 2 else 0.0),
+                ("components left out", self._energy * float(beyond[count])),
+                ("half the resolution", _FINE * self._energy * float(above[count]) if factor == 2 else 0.0),
+            ]
+            if (learned or grid > 1 or factor > 1) and (exact or count == 0):
+                continue
+            if not all(math.isfinite(error) for _, error in added) or (factor == 2 and self.stride * grid % 2):
+                continue
+            plan = replace(start, components=count, network=learned, grid=grid, factor=factor)
+            yield replace(plan, errors=(*start.errors, *added))
 
     def _mse(self, difference_Pkk: Tensor) -> float:
         return self._energy * float(in_metric(difference_Pkk).square().sum(1).mean())
@@ -238,41 +270,33 @@ class Planner:
                 return modes, error
         return MODES, 0.0
 
-    def _network(self, basis: PSFBasis, points: int, modes: int, budget: float) -> tuple[bool, float]:
-        if points != PUPIL or modes > MODES:
-            return False, 0.0
+    def _network_error(self, basis: PSFBasis, modes: int) -> float:
+        if basis.points != PUPIL or modes > MODES:
+            return math.inf
         high = self.high[:, : max(modes, 4) - 3]
-        error = self._energy * float((released().weights(high, basis) - basis.project(high)).square().sum(1).mean())
-        return (True, error) if error <= budget else (False, 0.0)
+        return self._energy * float((released().weights(high, basis) - basis.project(high)).square().sum(1).mean())
 
-    def _grid(self, basis: PSFBasis, modes: int, budget: float) -> tuple[int, float]:
-        """Whether every second point will do: weights interpolated between those against weights found at each."""
+    def _grid_error(self, basis: PSFBasis, modes: int) -> float:
+        """Of weights interpolated between every second point of the field's grid."""
         if self.stride > 8:
-            return 1, 0.0
-        field = ZernikeField(self.path, _PATCH, _PATCH, 0, modes, self.stride, q=self.q)
-        strongest = None if self.path.d_over_r0 == 0 else torch.tensor([self.strengths[1]])
-        high = field.draw([0], d_over_r0=strongest).high[0]
-        network = released() if basis.points == PUPIL else None
-        weights = blur_weights(high, basis, network)[..., : high.shape[-2] // 2 * 2 - 1, : high.shape[-1] // 2 * 2 - 1]
+            return math.inf
+        high = self._patch.high[0, :, : max(modes, 4) - 3]
+        weights = blur_weights(high, basis, released() if basis.points == PUPIL else None)
+        weights = weights[..., : (high.shape[-2] - 1) // 2 * 2 + 1, : (high.shape[-1] - 1) // 2 * 2 + 1]
         between = upsample(weights[..., ::2, ::2], 2, *weights.shape[-2:])
-        error = self._energy * float((between - weights)[..., 4:-4, 4:-4].square().sum(1).mean())
-        return (2, error) if error <= budget else (1, 0.0)
+        return self._energy * float((between - weights)[..., 4:-4, 4:-4].square().sum(1).mean())
 
-    def _components(self, basis: PSFBasis, budget: float, wanted: int | None, exact: bool) -> tuple[int, int, float]:
-        """Resolution and number of components of least work."""
-        variance = basis.variance.double()
-        beyond = basis.left + torch.cat((variance.flip(0).cumsum(0).flip(0), variance.new_zeros(1)))
-        above = torch.cat((variance.new_zeros(1), (variance * self._above_half(basis)).cumsum(0)))
-        options = []
-        for factor in (1,) if exact or self.stride % 2 else (1, 2):
-            for count in (0, *(m for m in _COMPONENTS if m <= len(variance))) if wanted is None else (wanted,):
-                error = self._energy * float(beyond[count] + (above[count] if factor == 2 else 0.0))
-                options.append((error > budget, count / factor**2, error, factor, count))
-        within = [option for option in options if not option[0]]
-        _, _, error, factor, count = min(within) if within else min(options, key=lambda option: option[2])
-        if wanted is not None and not within:
-            error, factor = self._energy * float(beyond[wanted]), 1
-        return (1 if count == 0 else factor), count, error
+    @cached_property
+    def _patch(self) -> Draw:
+        """A small piece of the air at its strongest."""
+        field = ZernikeField(self.path, _PATCH, _PATCH, 0, MODES, self.stride, q=self.q)
+        return field.draw([0], d_over_r0=torch.tensor([self.strengths[1]]))
+
+    def _crossing_error(self, basis: PSFBasis) -> float:
+        """Of one weight where points with different ones arrive: the more, the faster the tilt changes."""
+        tilts = self._patch.tilt[0]
+        slope = [(tilts.diff(dim=axis) / self.stride).square().sum(1).mean() for axis in (-1, -2)]
+        return _CROSSING * self._energy * float(basis.variance.sum() + basis.left) * float(sum(slope) / 2)
 
     @staticmethod
     def _above_half(basis: PSFBasis) -> Tensor:
@@ -292,21 +316,20 @@ class Planner:
         return replace(plan, work=tuple((name, own[name], full[name]) for name in full))
 
     def _work(self, plan: Plan) -> dict[str, float]:
-        """Floating-point operations of a frame by stage, 1e9."""
+        """Time of a frame by stage, ms, as two cores of a server of 2024 take it: for choosing, and for orientation."""
         pixels = self.size[0] * self.size[1]
         bins = pixels / self.stride**2 * 1.65**2
-        orders = noll_to_nm(plan.modes)[0]
         points = pixels / (self.stride * plan.grid) ** 2 if plan.blur and plan.components else 0
-        exact = 2 * plan.points**2 * (plan.modes + 8) + 20 * (2 * plan.points) ** 2 * math.log2(2 * plan.points)
-        network = 2 * (990 + 23_760)
-        project = 2 * (198 if plan.network else 4 * plan.points**2) * plan.components
-        transforms = 2 + plan.components / plan.factor**2 if plan.blur else 0
-        return {
-            "field": 1e-9 * bins * (2.5 * plan.modes * math.log2(max(bins, 2)) + 4 * 16 * orders + 6 * plan.modes),
-            "tilt": 1e-9 * pixels * self.channels * 64 * plan.tilt,
-            "weights": 1e-9 * points * ((network if plan.network else exact) + project),
-            "blur": 1e-9 * transforms * pixels * self.channels * (2.5 * math.log2(pixels) + 4),
+        learned = 800 + 6 * plan.components
+        exact = (3300 + 25 * plan.components) * (plan.points / PUPIL) ** 2
+        component = 3.6 if plan.factor == 1 else 0.6
+        nanoseconds = {
+            "field": 7 * bins * plan.modes,
+            "tilt": 19 * pixels * self.channels * plan.tilt,
+            "weights": points * (learned if plan.network else exact),
+            "blur": (6 + component * plan.components) * pixels * self.channels * plan.blur,
         }
+        return {stage: 1e-6 * value for stage, value in nanoseconds.items()}
 
 
 def _rows(count: int) -> int:

@@ -260,6 +260,7 @@ class Simulator(nn.Module):
         def picture(x: Tensor) -> Tensor:
             return finish(x).expand(-1, -1, channels, -1, -1)
 
+        shift = upsample(tilts, draw.stride, *padded.shape[-2:])
         still_air = not bool(draw.coefficients.detach().any())
         busy = self._busy(padded, tilts)
         if still_air or busy.area == 0:
@@ -271,6 +272,7 @@ class Simulator(nn.Module):
             look = Look(
                 around.of(padded),
                 around.of(tilts, self.stride),
+                around.of(shift),
                 around.of(high, self.stride),
                 self.stride,
                 self._planned,
@@ -293,7 +295,7 @@ class Simulator(nn.Module):
         return Turbulent(
             frames=self.sensor(picture(frames), noise_seed),
             tilt_only=exposed(picture(tilt_only), exposures),
-            tilt=exposed(finish(upsample(tilts, draw.stride, *padded.shape[-2:])), exposures),
+            tilt=exposed(finish(shift), exposures),
             draw=draw,
             _blur_only=lambda: exposed(picture(blur_only()), exposures),
         )
@@ -307,6 +309,8 @@ class Simulator(nn.Module):
             raise InputError(f"the scene has {scene_BTCHW.shape[2]} channels for {len(self.wavelengths)} wavelengths")
         if not bool(torch.isfinite(scene_BTCHW).all()):
             raise InputError("the scene holds NaN or infinite values")
+        if not bool(torch.isfinite(draw.coefficients).all()):
+            raise InputError("the draw holds NaN or infinite values")
         grid = (self.field.rows, self.field.columns)
         if (draw.stride, draw.margin, *draw.coefficients.shape[-2:]) != (self.stride, self.margin, *grid):
             raise InputError(

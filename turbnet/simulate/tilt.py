@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 from turbnet.errors import InputError
 
 _ITERATIONS = 12
+_SETTLED = 1e-3  # pixels
 
 
 def upsample(field_BChw: Tensor, stride: int, height: int, width: int) -> Tensor:
@@ -46,7 +47,10 @@ def displacement(tilt_B2hw: Tensor, stride: int) -> Tensor:
     """
     shift = tilt_B2hw
     for _ in range(_ITERATIONS):
+        before = shift
         shift = sample(tilt_B2hw, -shift / stride)
+        if bool((shift.detach() - before.detach()).abs().max() < _SETTLED):
+            break
     return shift
 
 
@@ -73,9 +77,13 @@ def tilt(image_BCHW: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
         return image_BCHW
     if not bool(torch.isfinite(tilt_B2hw).all()):
         raise InputError("the tilt holds NaN or infinite values")
-    *_, height, width = image_BCHW.shape
-    splat: Tensor = _Splat.apply(image_BCHW, _grid(upsample(tilt_B2hw, stride, height, width)))
-    return splat
+    return splat(image_BCHW, upsample(tilt_B2hw, stride, *image_BCHW.shape[-2:]))
+
+
+def splat(image_BCHW: Tensor, shift_B2HW: Tensor) -> Tensor:
+    """`tilt` with the shift of every pixel, (B, 2, H, W)."""
+    moved: Tensor = _Splat.apply(image_BCHW, _grid(shift_B2HW))
+    return moved
 
 
 class _Splat(torch.autograd.Function):
