@@ -8,13 +8,13 @@ import torch
 
 from turbnet.atmosphere.covariance import drift_covariance, zernike_covariance
 from turbnet.atmosphere.path import OpticalPath
-from turbnet.atmosphere.profiles import Array, Constant, Tabulated
+from turbnet.atmosphere.profiles import Array, Constant, Profile, Tabulated
 from turbnet.report import Row
 from turbnet.simulate.field import ZernikeField
 
 Track = Callable[[str, int], Iterable[int]]
 
-PATHS = {
+PATHS: dict[str, Profile] = {
     "constant Cn2": Constant(1e-15),
     "Cn2 falling towards the scene": Tabulated((0, 7000), (2e-15, 0)),
     "Cn2 rising towards the scene": Tabulated((0, 7000), (0, 2e-15)),
@@ -48,7 +48,9 @@ def measure(draws: int, track: Track) -> list[Row]:
         for mode, letter in ((0, "a2"), (1, "a3")):
             theory = exact[mode, mode, -1] / exact[mode, mode, 0]
             edge = drawn[mode, mode, -1] / drawn[mode, mode, 0]
-            rows.append(Row.compared(f"field, {name}: correlation of {letter} at opposite edges, 512 px", edge, theory, 0.06))
+            rows.append(
+                Row.compared(f"field, {name}: correlation of {letter} at opposite edges, 512 px", edge, theory, 0.06)
+            )
         worst = max((_drift_error(field, mode, way) for mode, way in product((2, 3), TRAVEL)), key=abs)
         rows.append(Row.compared(f"field, {name}: worst error of the tilts' autocorrelation, held", worst, 0.0, 0.05))
     rows += _drawn_drift(max(draws // 8, 20), track)

@@ -3,13 +3,16 @@
 import importlib
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from turbnet.cli.typed import run_typed
 
-SUITES = {"physics": "optics, atmosphere and split-step against theory"}
+SUITES = {
+    "physics": "optics, atmosphere and split-step against theory",
+    "simulator": "the in-loop simulator: exactness, speed, run time against error",
+}
 
 
 def main(arguments: list[str]) -> int:
@@ -32,14 +35,44 @@ def physics(
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
 ) -> int:
     """Measure screens, split-step propagation and speed against theory; exit code 1 if a row misses its tolerance."""
+    _check_outputs(json, figures)
+    bench = importlib.import_module("turbnet.bench.physics")
+    return _finish(bench, bench.run(quick=quick, quiet=quiet), json, figures)
+
+
+def simulator(
+    json: Annotated[Path | None, typer.Option(help="write the rows to this file")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="write the figure of run time against error into this folder")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(help="families to measure, of field,picture,split-step,speed,curve; comma-separated")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="fewer draws: a minute or two, wide error bars")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
+) -> int:
+    """Measure the in-loop simulator; exit code 1 if a row misses its limit."""
+    from turbnet.errors import InputError
+
+    _check_outputs(json, figures)
+    bench = importlib.import_module("turbnet.bench.simulator")
+    families = bench.FAMILIES if only is None else tuple(only.split(","))
+    unknown = [name for name in families if name not in bench.FAMILIES]
+    if unknown:
+        raise InputError(f"--only {only}: there is no family {unknown[0]!r}; they are {', '.join(bench.FAMILIES)}")
+    return _finish(bench, bench.run(families, quick=quick, quiet=quiet), json, figures)
+
+
+def _check_outputs(json: Path | None, figures: Path | None) -> None:
     from turbnet.errors import InputError
 
     if json is not None and not json.parent.is_dir():
         raise InputError(f"cannot write {json}: the folder {json.parent} does not exist; create it first")
     if figures is not None and figures.exists() and not figures.is_dir():
         raise InputError(f"cannot write figures into {figures}: it is a file; name a folder")
-    bench = importlib.import_module("turbnet.bench.physics")
-    found = bench.run(quick=quick, quiet=quiet)
+
+
+def _finish(bench: Any, found: Any, json: Path | None, figures: Path | None) -> int:
     print(found.text)
     if figures is not None:
         bench.draw_figures(found.panels, figures)
