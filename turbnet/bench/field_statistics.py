@@ -53,7 +53,7 @@ def measure(draws: int, track: Track) -> list[Row]:
             )
         worst = max((_drift_error(field, mode, way) for mode, way in product((2, 3), TRAVEL)), key=abs)
         rows.append(Row.compared(f"field, {name}: worst error of the tilts' autocorrelation, held", worst, 0.0, 0.05))
-    rows += _drawn_drift(max(draws // 8, 20), track)
+    rows += _drawn_drift(max(draws // 3, 20), track)
     return rows
 
 
@@ -81,7 +81,7 @@ def _drift_error(field: ZernikeField, mode: int, way: float) -> float:
 def _drawn_drift(draws: int, track: Track) -> list[Row]:
     """The tilts' autocorrelation of drawn clips, against theory within 5 % or three standard errors."""
     path = OpticalPath(0.2034, 7000.0, PATHS["constant Cn2"], 525e-9)
-    field = ZernikeField(path, 125, 125, modes=3, stride=16)
+    field = ZernikeField(path, 125, 125, modes=3, stride=STRIDE)
     products = np.zeros((draws, len(TRAVEL), 2))
     squares = np.zeros((draws, 2))
     for seed in track("field, frozen flow", draws):
