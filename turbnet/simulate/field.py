@@ -152,8 +152,9 @@ class ZernikeField(nn.Module):
         keep("_layer_scale", path.distance / z, torch.float64)
 
         exact = _tilt_variance(path, z, cn2_dz, k0)
-        drawn = self._energy("_grid", 2, 2).sum((1, 2)) + self._energy("_low", 2, 2).sum(1)
-        keep("_common_tilt", np.sqrt(np.maximum(exact - drawn.numpy(), 0.0)), dtype)  # per layer
+        drawn = [self._energy("_grid", j, j).sum((1, 2)) + self._energy("_low", j, j).sum(1) for j in (2, 3)]
+        missing = exact[:, None] - torch.stack(drawn, 1).numpy()  # not the same for x and y where cells are oblong
+        keep("_common_tilt", np.sqrt(np.maximum(missing, 0.0)), dtype)  # layer, mode
 
     def _energy(self, waves: str, i: int, j: int) -> Tensor:
         """Cross energy of two modes in each wave of each layer, real part and imaginary part as 1 and i: complex."""
@@ -190,7 +191,7 @@ class ZernikeField(nn.Module):
             summed = (energy * factors).sum(0).numpy().ravel()
             k_x, k_y = (v.numpy().ravel() for v in k)
             total = total + (np.exp(1j * (at_x * k_x + at_y * k_y)) @ summed).real
-        return total + (float(self._common_tilt.double().square().sum()) if i == j and i in (2, 3) else 0.0)
+        return total + (float(self._common_tilt[:, i - 2].double().square().sum()) if i == j and i in (2, 3) else 0.0)
 
     @property
     def _grid_cell(self) -> Tensor:
@@ -298,7 +299,7 @@ class ZernikeField(nn.Module):
             grid_cell, low_cell = self._cells(seed)
             grid = grid * self._drift(shift, self._grid_k + grid_cell)
             low = low * self._drift(shift, self._low_k + low_cell)
-        common = common * self._common_tilt[:, None]
+        common = common * self._common_tilt
         if strength_L is not None:
             amplitude = strength_L.sqrt()
             grid, low = grid * amplitude[:, None, None, None], low * amplitude[:, None]

@@ -31,6 +31,7 @@ _RINGS, _SPOKES = 5, 12  # of the cubature, over half the disk
 _RADIUS = 8.0  # pixels to which amplitudes are summed
 _SIZE = 2 * PUPIL - 1
 _CHUNK = 1024
+_BASES = 8  # whose projections are kept: one for each wavelength of a few simulators
 
 _EVEN = [j - 4 for j in range(4, MODES + 1) if noll_to_nm(j)[0] % 2 == 0]
 _ODD = [j - 4 for j in range(4, MODES + 1) if noll_to_nm(j)[0] % 2]
@@ -62,6 +63,7 @@ class PhaseToSpace(nn.Module):
         missing = MODES - 3 - high_PN.shape[1]
         if missing < 0:
             raise ParameterError(f"the phase-to-space network knows modes to {MODES}, not {high_PN.shape[1] + 3}")
+        high_PN = high_PN.to(self.even)
         if missing:
             high_PN = torch.cat((high_PN, high_PN.new_zeros(len(high_PN), missing)), 1)
         u, v = high_PN[:, _EVEN] @ self.even, high_PN[:, _ODD] @ self.odd
@@ -81,20 +83,24 @@ class PhaseToSpace(nn.Module):
     def weights(self, high_PN: Tensor, basis: PSFBasis) -> Tensor:
         """Weights (P, M) of the PSFs in a basis; differentiable in the coefficients."""
         matrix, offset = self._through(basis)
-        return torch.cat([torch.addmm(offset, self.features(chunk), matrix) for chunk in high_PN.split(_CHUNK)])
+        parts = [torch.addmm(offset, self.features(chunk), matrix) for chunk in high_PN.split(_CHUNK)]
+        return torch.cat(parts).to(high_PN)
 
     def _through(self, basis: PSFBasis) -> tuple[Tensor, Tensor]:
         """The last layer followed by the basis's projection: (F, M) and (M,)."""
         if basis.points != PUPIL:
             raise ParameterError(f"the phase-to-space network knows apertures of {PUPIL} samples, not {basis.points}")
-        if basis not in self._known:
+        projection = self._known.get(basis)
+        if projection is None:
             nyquist = basis.nyquist_columns[:, :-1].T.view(-1, 2 * PUPIL, 2 * PUPIL)
             # A PSF that sums to one at Nyquist pixels sums to 1 / q^2 when read at pixels of q.
             dual = basis.q**2 * torch.fft.fftshift(nyquist, dim=(1, 2))[:, 1:, 1:].flatten(1).to(self.head.weight)
             offset = dual @ self.head.bias.detach() - (basis.dual * basis.mean).sum((1, 2)).to(dual)
-            self._known.clear()
-            self._known[basis] = ((dual @ self.head.weight.detach()).T.contiguous(), offset)
-        return self._known[basis]
+            projection = ((dual @ self.head.weight.detach()).T.contiguous(), offset)
+            if len(self._known) >= _BASES:
+                self._known.clear()
+            self._known[basis] = projection
+        return projection
 
     @property
     def _known(self) -> dict[PSFBasis, tuple[Tensor, Tensor]]:

@@ -20,7 +20,7 @@ def read_weights(name: str) -> dict[str, Tensor]:
     try:
         data = (folder / f"{name}.safetensors").read_bytes()
         expected = json.loads((folder / f"{name}.json").read_text())["sha256"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"the weights {name} cannot be read: {error}; install turbnet again") from error
     if hashlib.sha256(data).hexdigest() != expected:
         raise InputError(f"the weights {name} are damaged or were changed: their SHA-256 is not that of their card")
