@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from turbnet.simulate.waves import grid_waves, held, low_waves
+from turbnet.simulate.waves import _LEVELS, grid_waves, held, low_waves
 
 STEP = (0.7, 1.3)  # dK along x and y, rad/m
 
@@ -12,7 +12,7 @@ STEP = (0.7, 1.3)  # dK along x and y, rad/m
 def test_cells_below_the_grid_tile_the_block_that_it_gives_up():
     """3 x 3 bins less the smallest block of all; a wave stands for a pair of cells."""
     waves = low_waves(STEP)
-    assert 2 * waves.area.sum() == pytest.approx((9 - 3.0**-8) * STEP[0] * STEP[1], rel=1e-12)
+    assert 2 * waves.area.sum() == pytest.approx((9 - 9.0**-_LEVELS) * STEP[0] * STEP[1], rel=1e-12)
     bins = grid_waves((16, 16), STEP)
     assert (~held(bins)).sum() == 6  # ky = -1, 0, 1 of kx = 0, 1
 
@@ -24,6 +24,10 @@ def test_waves_below_the_grid_are_one_of_each_pair():
     assert not both & {(-x, -y, w) for x, y, w in both}
 
 
+def _seen_by_a_tilt(ky: float, kx: float, k0: float) -> float:
+    return (kx**2 + ky**2 + k0**2) ** (-11 / 6) * (kx**2 + ky**2)
+
+
 @pytest.mark.parametrize("k0", [0.0, 0.5, 5.0])
 def test_a_cell_carries_the_energy_of_a_tilt_in_it(k0):
     """Its weight times its area times what a tilt sees at its middle is the integral over the cell."""
@@ -31,10 +35,9 @@ def test_a_cell_carries_the_energy_of_a_tilt_in_it(k0):
     weights = waves.weight(k0)
     for index in range(0, len(waves.x), 29):
         x, y, half = waves.x[index], waves.y[index], waves.width[index] / 2
-        seen = lambda kx, ky: (kx**2 + ky**2 + k0**2) ** (-11 / 6) * (kx**2 + ky**2)  # noqa: E731
         (x0, x1), (y0, y1) = ((v - half * s, v + half * s) for v, s in zip((x, y), STEP, strict=True))
-        exact, _ = dblquad(lambda ky, kx: seen(kx, ky), x0, x1, y0, y1, epsrel=1e-6)
-        assert weights[index] * waves.area[index] * seen(x, y) == pytest.approx(exact, rel=0.02)
+        exact, _ = dblquad(_seen_by_a_tilt, x0, x1, y0, y1, args=(k0,), epsrel=1e-6)
+        assert weights[index] * waves.area[index] * _seen_by_a_tilt(y, x, k0) == pytest.approx(exact, rel=0.02)
 
 
 def test_half_a_grid_is_the_rows_of_positive_frequency():
