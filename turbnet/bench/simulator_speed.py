@@ -186,7 +186,14 @@ def panel(points: list[Point]) -> Panel:
         time_ms, psnr = np.array([p.milliseconds for p in own]), np.array([p.psnr for p in own])
         series.append(Series(f"$D/r_0$ = {strength:g}", time_ms, psnr))
     title = "512 x 512 colour frame, new draw every frame"
-    return Panel("simulator-time-error", title, "time of a frame (ms)", "PSNR against dense scatter (dB)", series)
+    return Panel(
+        "simulator-time-error",
+        title,
+        "time of a frame (ms)",
+        "PSNR against dense scatter (dB)",
+        series,
+        ("log", "linear"),
+    )
 
 
 def rows(points: list[Point]) -> list[Row]:
