@@ -1,5 +1,6 @@
 """Simulated clips the classical methods are tried on: photographs of scikit-image through the simulator."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,11 @@ def simulated(
     clip = clip + noise * np.random.default_rng(seed).standard_normal(clip.shape)
     coded = (to_srgb(clip.clip(0, 1)) * 255).round() / 255
     return Simulated(scene, to_linear(coded).astype(np.float32), seen.tilt[0].numpy())
+
+
+@pytest.fixture(scope="session")
+def simulated_clip() -> Callable[..., Simulated]:
+    return simulated
 
 
 @pytest.fixture(scope="session")

@@ -12,13 +12,14 @@ L is the still scene, S what moves and flickers. Inexact augmented Lagrangian: L
 
 .. math::
     R_t = \frac{\sum_s w_s\, I_s}{\sum_s w_s}, \qquad
-    w_s = \exp\{-\max(d_s / 2\sigma^2 - 1,\ 0)\}, \qquad
-    d_s(x) = \overline{(Y_s - Y_t)^2}
+    w_s = \exp\{-d_s / 2 h \sigma^2\}, \qquad
+    d_s(x) = \tfrac12 \overline{e_{st}^2 + e_{ts}^2}
 
-with the bar a mean over the patch around x and Y the luminance. sigma^2(x), the patch mean of the robust variance over
-time, is what dance and noise do at x by themselves: two frames of a still scene differ by 2 sigma^2, so w is near 1 there
-and R near the mean. What moves differs by more and is kept as frame t has it. Patches: Buades, Coll & Morel, CVPR (2005), here
-along time alone; over turbulence: Mao, Chimitt & Chan, IEEE TCI 6, 1415 (2020).
+e_st(x) is how far the luminance of frame t at x lies outside the range that frame s covers within four pixels of x:
+dance moves things within that range and gives 0, what another frame does not have gives the whole difference. The bar is
+a mean over the patch around x; sigma^2(x), the patch mean of the robust variance over time, is the scale of what dance
+and noise do there; h = 0.1. For a still scene w is near 1 and R near the mean; what moves is kept as frame t has it.
+Patches: Buades, Coll & Morel, CVPR (2005), here along time; over turbulence: Mao, Chimitt & Chan, IEEE TCI 6, 1415 (2020).
 """
 
 from collections.abc import Iterator
@@ -29,9 +30,13 @@ from turbnet.classical.local import Array, check_clip, local_mean, luminance
 from turbnet.errors import ParameterError, check_range
 from turbnet.simulate.parallel import on_all_cores
 
+REACH = 4
+"""How far dance may carry things for frames to count as alike, pixels."""
+
 PATCH = 5
 """Half the side of the patches that are compared, pixels."""
 
+_TOLERANCE = np.float32(0.1)  # h: of still scenes at D/r0 = 3, d / 2 sigma^2 is below it on 97 % of the pixels
 _QUANTUM = (1 / 255) ** 2 / 12  # variance of rounding to 8 bits: no two frames are more alike than this
 
 
@@ -97,10 +102,36 @@ def still_variance(luminance_THW: Array, radius: int = PATCH) -> Array:
     return local_mean(robust**2, radius) + np.float32(_QUANTUM)
 
 
-def similarity(luminance_THW: Array, index: int, variance_HW: Array, radius: int = PATCH) -> Array:
-    """w (T, H, W) of every frame for frame `index`: one where they show the same thing, and at `index` itself."""
-    difference = local_mean((luminance_THW - luminance_THW[index]) ** 2, radius)
-    return np.exp(-np.maximum(difference / (2 * variance_HW) - 1, 0))
+class Similarity:
+    """Where other frames of a clip show what one shows.
+
+    Args:
+        luminance_THW: of the clip.
+        radius: patches are (2 radius + 1)^2 pixels.
+    """
+
+    def __init__(self, luminance_THW: Array, radius: int = PATCH) -> None:
+        from scipy.ndimage import maximum_filter, minimum_filter
+
+        self._y, self._radius = luminance_THW, radius
+        self._highest, self._lowest = (
+            extreme(luminance_THW, size=2 * REACH + 1, axes=(1, 2)) for extreme in (maximum_filter, minimum_filter)
+        )
+        self._scale = 2 * _TOLERANCE * still_variance(luminance_THW, radius)
+
+    def weights(self, index: int) -> Array:
+        """w (T, H, W) of every frame for frame `index`; one at `index` itself."""
+        weights = np.empty_like(self._y)
+        for s, y in enumerate(self._y):
+            here = _outside(self._y[index], self._lowest[s], self._highest[s])
+            there = _outside(y, self._lowest[index], self._highest[index])
+            weights[s] = np.exp(-local_mean(0.5 * (here**2 + there**2), self._radius) / self._scale)
+        return weights
+
+
+def _outside(value: Array, lowest: Array, highest: Array) -> Array:
+    """How far a value lies outside a range."""
+    return np.asarray(np.maximum(np.maximum(value - highest, lowest - value), 0), np.float32)
 
 
 def non_local_mean(frames_THWC: Array, index: int, radius: int = PATCH) -> Array:
@@ -115,8 +146,7 @@ def non_local_mean(frames_THWC: Array, index: int, radius: int = PATCH) -> Array
     """
     clip = check_clip(frames_THWC)
     index = int(check_range("index", index, 0, len(clip) - 1))
-    y = luminance(clip)
-    return weighted_mean(clip, similarity(y, index, still_variance(y, radius), radius))
+    return weighted_mean(clip, Similarity(luminance(clip), radius).weights(index))
 
 
 def non_local_means(
@@ -129,11 +159,10 @@ def non_local_means(
         cores: frames at a time.
     """
     clip = check_clip(frames_THWC)
-    y = luminance(clip)
-    variance_HW = still_variance(y, radius)
+    similarity = Similarity(luminance(clip), radius)
 
     def one(index: int) -> Array:
-        weights = similarity(y, index, variance_HW, radius)
+        weights = similarity.weights(index)
         return weighted_mean(clip, weights if weights_THW is None else weights * weights_THW)
 
     yield from on_all_cores(one, range(len(clip)), cores)
@@ -146,4 +175,4 @@ def weighted_mean(frames_THWC: Array, weights_THW: Array) -> Array:
     mean = np.zeros(frames_THWC.shape[1:], np.float32)
     for frame_HWC, weight_HW in zip(frames_THWC, weights_THW, strict=True):
         mean += frame_HWC * np.where(nowhere, np.float32(1), weight_HW)[..., None]
-    return mean / np.where(nowhere, np.float32(len(frames_THWC)), total)[..., None]
+    return np.divide(mean, np.where(nowhere, np.float32(len(frames_THWC)), total)[..., None], dtype=np.float32)
