@@ -6,7 +6,7 @@ r"""The default pipeline: reference, registration, fusion, blind deconvolution; 
 3. **Fusion.** For each frame the registered ones are averaged where they show the same, sharper ones counting a little
    more: (S + mean S)^4, S the local variance, which goes like S^2 near the mean but never outvotes a flat object that
    passes before a lively scene.
-4. **Deconvolution.** The dance tells D/r0, that the mean PSF; the kernel is refined on the middle frame, blindly, and
+4. **Deconvolution.** The dance tells D/r0, that the mean PSF; one blind round on the middle frame refines the kernel, and
    every frame is deconvolved with it by total variation. The noise is what registered frames still differ by, over the
    root of how many are averaged.
 
@@ -30,6 +30,8 @@ from turbnet.simulate.parallel import on_all_cores
 
 PASSES = 2
 REDUCTION = 2
+ROUNDS = 1
+"""Of the blind search. The dance knows the kernel's width better than alternating minimisation does, which drifts."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def restore(frames_THWC: Array, cores: int = 1, report: Callable[[float], object
         report(0.3)
         return Restored(fused, strength, np.ones((1, 1), np.float32))
     noise = float(np.sqrt(still_variance(y).mean() / len(y)))
-    kernel = blind_kernel(luminance(fused[len(fused) // 2]), noise, min(strength, STRONGEST))
+    middle_HW = luminance(fused[len(fused) // 2])
+    kernel = blind_kernel(middle_HW, noise, min(strength, STRONGEST), rounds=ROUNDS)
 
     def sharpen(frame_HWC: Array) -> Array:
         return total_variation(frame_HWC, kernel, noise)
