@@ -12,8 +12,8 @@ from turbnet.classical.local import luminance
 from turbnet.errors import InputError, ParameterError
 from turbnet.media.colour import to_linear
 from turbnet.metrics.fidelity import psnr
-from turbnet.simulate.blur import tilt_free_psf
-from turbnet.simulate.field import TILT_PIXELS
+from turbnet.simulate.draw import TILT_PIXELS
+from turbnet.simulate.psf_basis import tilt_free_psf
 
 NOISE = 0.003
 

@@ -5,7 +5,7 @@ The kernel is sought among
 .. math:: h = \phi_0 + \sum_m \beta_m \phi_m
 
 phi_0 the mean tilt-free PSF of Kolmogorov turbulence around a given D/r0 and phi_m its principal components
-(`turbnet.simulate.blur.psf_basis`): twenty numbers instead of a thousand, and never a kernel that no air can make.
+(`turbnet.simulate.psf_basis.psf_basis`): twenty numbers instead of a thousand, and never a kernel that no air can make.
 By turns
 
 .. math::
@@ -34,8 +34,8 @@ from turbnet.atmosphere.noll import noll_covariance, noll_matrix
 from turbnet.classical.deconvolution import total_variation, transfer_function
 from turbnet.classical.local import Array, luminance
 from turbnet.errors import InputError, check_range
-from turbnet.simulate.blur import psf_basis, tilt_free_psf
-from turbnet.simulate.field import TILT_PIXELS
+from turbnet.simulate.draw import TILT_PIXELS
+from turbnet.simulate.psf_basis import psf_basis, tilt_free_psf
 
 WEAKEST, STRONGEST = 0.5, 8.0
 """D/r0 between which PSFs are made; below, the air does not blur."""
