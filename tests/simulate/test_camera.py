@@ -12,7 +12,7 @@ def test_q_is_the_pixel_over_that_of_nyquist():
     assert camera.sampling == pytest.approx(1.0)
     # In the scene: the pixel's image there over the Nyquist pixel of the path.
     path = camera.path(3000.0, Constant(1e-15))
-    assert pytest.approx(camera.sampling * path.pixel) == 5e-6 * 3000.0 / 2.0
+    assert camera.sampling * path.pixel == pytest.approx(5e-6 * 3000.0 / 2.0)
 
 
 def test_the_path_is_seen_through_its_aperture():
