@@ -79,4 +79,6 @@ def test_bad_input(picture, box, says):
 
 def test_any_reader_will_do():
     boxes = [TextBox(0, 0, 10, 5, "yes"), TextBox(0, 6, 10, 5, "no")]
-    assert score_text(np.zeros((20, 30, 3)), boxes, lambda crops: ["YES"] * len(crops)) == TextScore(3, 5, 1, 2)
+    assert score_text(np.zeros((20, 30, 3)), boxes, lambda picture, boxes: ["YES"] * len(boxes)) == TextScore(
+        3, 5, 1, 2
+    )

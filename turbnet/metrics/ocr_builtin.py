@@ -15,16 +15,17 @@ import onnxruntime
 from numpy.typing import NDArray
 from PIL import Image
 
+from turbnet.data.boxes import TextBox
 from turbnet.deploy.card import RecogniserCard
 from turbnet.deploy.seal import verify
 from turbnet.errors import InputError
-from turbnet.metrics.text import Picture
+from turbnet.metrics.text import Picture, crop_boxes
 
 _GREY = np.array([0.299, 0.587, 0.114])
 
 
 class Recogniser:
-    """Reads crops of one word or line each.
+    """Reads the boxes of a picture, one word or line each.
 
     Args:
         data: the bytes of a sealed recogniser; None: the one that comes with turbnet.
@@ -58,9 +59,14 @@ class Recogniser:
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
-    def __call__(self, crops: Sequence[Picture]) -> list[str]:
-        """What stands in each crop (H, W, 3) or (H, W, 1), sRGB in [0, 1]."""
-        return [self._decode(self.scores(self.line(crop)[None, None])[0].argmax(-1)) for crop in crops]
+    def __call__(self, picture: Picture, boxes: Sequence[TextBox]) -> list[str]:
+        """What stands in each box of a picture (H, W, 3) or (H, W, 1), sRGB in [0, 1].
+
+        Raises:
+            InputError: a box does not lie inside the picture, the picture holds NaN.
+        """
+        lines = [self.line(crop)[None, None] for crop in crop_boxes(picture, boxes)]
+        return [self._decode(self.scores(line)[0].argmax(-1)) for line in lines]
 
     def scores(self, lines_B1HW: NDArray[np.float32]) -> NDArray[np.float32]:
         """Log-probabilities (B, W / stride, classes) of lines (B, 1, line_height, W)."""

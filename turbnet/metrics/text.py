@@ -28,10 +28,10 @@ MARGIN = 0.15
 
 
 class TextReader(Protocol):
-    """Reads crops of one word or line each."""
+    """Reads the boxes of a picture."""
 
-    def __call__(self, crops: Sequence[Picture]) -> list[str]:
-        """What stands in each crop (H, W, 3), sRGB in [0, 1]."""
+    def __call__(self, picture: Picture, boxes: Sequence[TextBox]) -> list[str]:
+        """What stands in each box of a picture (H, W, 3), sRGB in [0, 1]; the boxes' own texts are not looked at."""
         ...
 
 
@@ -125,10 +125,10 @@ def crop_boxes(picture: Picture, boxes: Sequence[TextBox], margin: float = MARGI
     return crops
 
 
-def score_text(picture: Picture, boxes: Sequence[TextBox], reader: TextReader, margin: float = MARGIN) -> TextScore:
+def score_text(picture: Picture, boxes: Sequence[TextBox], reader: TextReader) -> TextScore:
     """What `reader` reads in the boxes of a picture (H, W, 3), sRGB in [0, 1], against their transcripts.
 
     Raises:
         InputError: as `crop_boxes` and `compare_texts`.
     """
-    return compare_texts(reader(crop_boxes(picture, boxes, margin)), [box.text for box in boxes])
+    return compare_texts(reader(picture, boxes), [box.text for box in boxes])
