@@ -40,15 +40,15 @@ class TextScore:
     """What was read right; scores add up.
 
     Attributes:
-        errors: edits between what was read and the transcripts.
+        errors: edits between what was read and the transcripts, or how many are expected.
         characters: letters and digits of the transcripts.
-        right: boxes read without an error.
+        right: boxes read without an error, or how many are expected.
         boxes: all of them.
     """
 
-    errors: int = 0
+    errors: float = 0
     characters: int = 0
-    right: int = 0
+    right: float = 0
     boxes: int = 0
 
     def __add__(self, other: "TextScore") -> "TextScore":
