@@ -18,12 +18,13 @@ from torch import Tensor
 
 from turbnet.data.text import fonts
 from turbnet.data.text_lines import Lines, TextLines
+from turbnet.data.words import ALPHABET
 from turbnet.deploy.card import RecogniserCard
 from turbnet.deploy.export import TOLERANCE, flush_denormals, quiet_exporter, sealed
 from turbnet.media.atomic import atomic_path
 from turbnet.metrics.ocr_builtin import Recogniser
 from turbnet.metrics.text import edit_distance
-from turbnet.nets.crnn import ALPHABET, CRNN, LINE_HEIGHT, STRIDE, decode, encode
+from turbnet.nets.crnn import CRNN, LINE_HEIGHT, STRIDE, decode, encode
 from turbnet.progress import progress_bar
 
 BATCH, PEAK_RATE, SEED, SAVE_EVERY = 64, 3e-3, 0, 250
@@ -74,7 +75,7 @@ def train(steps: int, last: Path) -> CRNN:
         optimizer.load_state_dict(saved["optimizer"])
         schedule.load_state_dict(saved["schedule"])
         first = saved["step"]
-    lines = TextLines(TRAIN_FONTS, BATCH, SEED)
+    lines = TextLines(TRAIN_FONTS, LINE_HEIGHT, STRIDE, BATCH, SEED)
     with progress_bar() as progress:
         for step in progress.track(range(first, steps), total=steps, completed=first, description="training"):
             loss = ctc_loss(network, lines(step))
@@ -105,7 +106,7 @@ def ctc_loss(network: CRNN, lines: Lines) -> Tensor:
 @torch.no_grad()
 def error_rate(network: CRNN, severity: float) -> float:
     """Edits a character on lines of one severity, in fonts that were never trained on."""
-    lines, errors, characters = TextLines(TEST_FONTS, BATCH, SEED + 1), 0, 0
+    lines, errors, characters = TextLines(TEST_FONTS, LINE_HEIGHT, STRIDE, BATCH, SEED + 1), 0, 0
     for number in range(TEST_BATCHES):
         batch = lines(number, severity)
         for text, best in zip(batch.texts, network(batch.pictures).argmax(-1).tolist(), strict=True):

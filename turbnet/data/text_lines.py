@@ -18,8 +18,7 @@ from torch import Tensor
 
 from turbnet.atmosphere.noll import noll_covariance, noll_matrix
 from turbnet.data.text_scenes import load_font
-from turbnet.data.words import WORDS
-from turbnet.nets.crnn import ALPHABET, LINE_HEIGHT, STRIDE
+from turbnet.data.words import ALPHABET, WORDS
 from turbnet.simulate.blur import KERNEL, tilt_free_psf
 from turbnet.simulate.field import TILT_PIXELS
 
@@ -31,7 +30,7 @@ _INK = 8  # pixels between the canvas's edge and the ink, at least
 
 @dataclass(frozen=True)
 class Lines:
-    """Crops (B, 1, LINE_HEIGHT, W), grey sRGB values about [0, 1], and what they say, in ALPHABET."""
+    """Crops (B, 1, height, W), grey sRGB values about [0, 1], and what they say, in ALPHABET."""
 
     pictures: Tensor
     texts: list[str]
@@ -42,12 +41,17 @@ class TextLines:
 
     Args:
         font_paths: to write with.
+        height: of the crops, pixels.
+        multiple: their width is a multiple of this, pixels.
         batch: lines a batch.
         seed: of all batches.
     """
 
-    def __init__(self, font_paths: Sequence[Path], batch: int = 64, seed: int = 0) -> None:
-        self.font_paths, self.batch, self.seed = list(font_paths), batch, seed
+    def __init__(
+        self, font_paths: Sequence[Path], height: int = 32, multiple: int = 4, batch: int = 64, seed: int = 0
+    ) -> None:
+        self.font_paths, self.height, self.multiple = list(font_paths), height, multiple
+        self.batch, self.seed = batch, seed
         generator = torch.Generator().manual_seed(0)
         factor = torch.as_tensor(np.linalg.cholesky(noll_matrix(range(4, _MODES + 1))), dtype=torch.float32)
         strengths = torch.linspace(0, STRONGEST, _KERNELS)[:, None]
@@ -112,9 +116,9 @@ class TextLines:
         tall = bottom - top
         margin = tall[:, None] * rng.uniform(0.0, 0.35, (count, 4))
         left, top, right, bottom = left - margin[:, 0], top - margin[:, 1], right + margin[:, 2], bottom + margin[:, 3]
-        scale = (bottom - top) / LINE_HEIGHT  # native pixels a pixel of the crop
-        width = STRIDE * int(np.ceil(((right - left) / scale).max() / STRIDE))
-        y, x = np.mgrid[0:LINE_HEIGHT, 0:width] + 0.5
+        scale = (bottom - top) / self.height  # native pixels a pixel of the crop
+        width = self.multiple * int(np.ceil(((right - left) / scale).max() / self.multiple))
+        y, x = np.mgrid[0 : self.height, 0:width] + 0.5
         x_of = left[:, None, None] + x * scale[:, None, None]
         y_of = top[:, None, None] + y * scale[:, None, None]
         from_left, from_middle = x_of - ((left + right) / 2)[:, None, None], y_of - ((top + bottom) / 2)[:, None, None]
@@ -122,7 +126,7 @@ class TextLines:
         x_of, y_of = x_of + shear * from_middle, y_of + turn * from_left
         # The tilts' wobble: their part that changes within a line, a few nodes a word.
         nodes = torch.from_numpy(rng.normal(size=(count, 2, 3, 2 + width // 24))).float()
-        wobble = F.interpolate(nodes, (LINE_HEIGHT, width), mode="bicubic").numpy()
+        wobble = F.interpolate(nodes, (self.height, width), mode="bicubic").numpy()
         amount = 0.25 * (strengths ** (5 / 6) * rng.random(count))[:, None, None]
         x_of, y_of = x_of + amount * wobble[:, 0], y_of + amount * wobble[:, 1]
         grid = torch.from_numpy(np.stack((x_of / _WIDTH, y_of / _HEIGHT), -1) * 2 - 1).float()

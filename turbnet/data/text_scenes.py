@@ -11,7 +11,7 @@ ink, carried the same way. Ink and paper are `contrast` of full scale apart, in 
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -100,11 +100,14 @@ class TextScenes:
         size: tuple[float, float] = (10.0, 28.0),
         contrast: tuple[float, float] = (0.25, 1.0),
         perspective: float = 0.15,
+        font_paths: Sequence[Path] | None = None,
     ) -> None:
-        self.kind, self.size, self.contrast, self.perspective = kind, size, contrast, perspective
+        self._scene = partial(
+            render_scene, kind=kind, size=size, contrast=contrast, perspective=perspective, font_paths=font_paths
+        )
 
     def __call__(self, rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
-        return render_scene(rng, height, width, self.kind, self.size, self.contrast, self.perspective).picture
+        return self._scene(rng, height, width).picture
 
 
 def system_fonts() -> tuple[Path, ...]:

@@ -1,4 +1,6 @@
-"""Common English words of four to eleven letters, for text to be read."""
+"""What text to be read is made of: characters told apart without case, and common English words of four to ten letters."""
+
+import string
 
 _LIST = """
 able about above across action after again against almost alone along already also always amount anger animal answer
@@ -42,3 +44,5 @@ window winter wisdom without woman wonder wooden word work world worry worth wri
 zebra zero
 """
 WORDS: tuple[str, ...] = tuple(_LIST.split())
+
+ALPHABET = string.digits + string.ascii_lowercase

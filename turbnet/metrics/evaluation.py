@@ -251,7 +251,7 @@ def text_scorer(name: str) -> TextScorer:
     if name == "builtin":
         from turbnet.metrics.ocr_builtin import Recogniser
 
-        return partial(score_text, reader=Recogniser())
+        return partial(score_text, reader=Recogniser.load())
     if name in ("rapidocr", "rapidocr-find"):
         from turbnet.metrics.ocr_rapid import RapidReader
 

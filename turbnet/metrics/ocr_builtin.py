@@ -6,7 +6,6 @@ and blanks taken out, is the text. Needs neither torch nor lightning.
 """
 
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from PIL import Image
 from turbnet.data.boxes import TextBox
 from turbnet.deploy.card import RecogniserCard
 from turbnet.deploy.seal import verify
+from turbnet.deploy.weights import released_recogniser
 from turbnet.errors import InputError
 from turbnet.metrics.text import Picture, crop_boxes
 
@@ -28,15 +28,14 @@ class Recogniser:
     """Reads the boxes of a picture, one word or line each.
 
     Args:
-        data: the bytes of a sealed recogniser; None: the one that comes with turbnet.
+        data: the bytes of a sealed recogniser.
         threads: processor threads.
 
     Raises:
         InputError: the bytes are no recogniser of turbnet, or were changed.
     """
 
-    def __init__(self, data: bytes | None = None, threads: int = 1) -> None:
-        data = (resources.files("turbnet.weights") / "recogniser.onnx").read_bytes() if data is None else data
+    def __init__(self, data: bytes, threads: int = 1) -> None:
         verify(data)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
@@ -46,12 +45,13 @@ class Recogniser:
         self.card = RecogniserCard.from_metadata(self._session.get_modelmeta().custom_metadata_map)
 
     @classmethod
-    def load(cls, path: str | Path) -> "Recogniser":
-        """Read the recogniser in the file `path`.
+    def load(cls, path: str | Path | None = None) -> "Recogniser":
+        """Read the recogniser in the file `path`; None: the one that comes with turbnet.
 
         Raises:
             InputError: names the file and what is wrong with it.
         """
+        path = released_recogniser() if path is None else path
         try:
             return cls(Path(path).read_bytes())
         except OSError as error:

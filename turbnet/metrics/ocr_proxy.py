@@ -46,8 +46,8 @@ INK = 24
 _CASES = (string.digits + string.ascii_lowercase, string.digits + string.ascii_uppercase)
 _CHARACTERS = string.digits + string.ascii_lowercase + string.ascii_uppercase
 _EM, _ROOM = 48, 24  # pixels an em of the stored glyphs, and around them
-_BEYOND, _HALF = 2, 11  # a patch: pixels above and below the ink, half its width
-_REACH_X, _REACH_Y = 4, 3  # greatest shifts, pixels
+_BEYOND, _HALF = 2, 10  # a patch: pixels above and below the ink, half its width
+_REACH_X, _REACH_Y = 6, 3  # greatest shifts, pixels
 _MARGIN_X, _MARGIN_Y = _HALF + _REACH_X, _BEYOND + _REACH_Y
 _BETA, _TAU = 60.0, 0.03
 

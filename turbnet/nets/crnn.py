@@ -10,13 +10,13 @@ Sources: Shi, Bai & Yao, IEEE Trans. Pattern Anal. Mach. Intell. 39, 2298 (2017)
 the characters are digits and letters without regard to case.
 """
 
-import string
 from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
 
-ALPHABET = string.digits + string.ascii_lowercase
+from turbnet.data.words import ALPHABET
+
 BLANK = 0
 LINE_HEIGHT = 32
 STRIDE = 4
