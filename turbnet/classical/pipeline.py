@@ -17,9 +17,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from turbnet.classical.blind import STRONGEST, WEAKEST, blind_kernel, strength_of_dance
 from turbnet.classical.deconvolution import total_variation
+from turbnet.classical.edges import edge_width
 from turbnet.classical.fusion import soft_weights
 from turbnet.classical.local import Array, check_clip, luminance
 from turbnet.classical.reference import non_local_means, still_variance
@@ -32,6 +34,12 @@ PASSES = 2
 REDUCTION = 2
 ROUNDS = 1
 """Of the blind search. The dance knows the kernel's width better than alternating minimisation does, which drifts."""
+
+
+SHARP = 0.8
+"""Width of the sharpest edges of pictures that were never blurred, pixels."""
+EXPLAINED = 1.25
+"""How much wider than the kernel edges may be before a lens, focus or sampling must have blurred them as well."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,7 @@ def restore(frames_THWC: Array, cores: int = 1, report: Callable[[float], object
     noise = float(np.sqrt(still_variance(y).mean() / len(y)))
     middle_HW = luminance(fused[len(fused) // 2])
     kernel = blind_kernel(middle_HW, noise, min(strength, STRONGEST), rounds=ROUNDS)
+    kernel = _widened(kernel, edge_width(middle_HW))
 
     def sharpen(frame_HWC: Array) -> Array:
         return total_variation(frame_HWC, kernel, noise)
@@ -87,3 +96,16 @@ def restore(frames_THWC: Array, cores: int = 1, report: Callable[[float], object
     sharp = np.stack(list(on_all_cores(sharpen, fused, cores)))
     report(0.3)
     return Restored(sharp, strength, kernel)
+
+
+def _widened(kernel_kk: Array, width: float) -> Array:
+    """The kernel with the Gaussian blur that edges of this `width` show beyond what it explains, pixels."""
+    explained = 1 / (4 * np.pi * float((kernel_kk**2).sum()))  # of a Gaussian as peaked, its variance
+    seen = width**2 - SHARP**2
+    if seen <= EXPLAINED**2 * explained:
+        return kernel_kk
+    beyond = seen - explained
+    axis = np.arange(len(kernel_kk)) - len(kernel_kk) // 2
+    line = np.exp(-(axis**2) / (2 * beyond))
+    wide = fftconvolve(kernel_kk, np.outer(line, line), mode="same")
+    return np.asarray(np.maximum(wide, 0) / np.maximum(wide, 0).sum(), dtype=kernel_kk.dtype)
