@@ -196,7 +196,7 @@ class Planner:
             errors.append(("no tilt", shift))
         still = self._mse(self.exact - _point(self.exact))
         if components is None and not exact and still < 0.3 * budget:
-            plan = Plan(tolerance, 3, False, 0, tilt=tilt, network=False, errors=(*errors, ("no blur", still)))
+            plan = Plan(tolerance, modes or 3, False, 0, tilt=tilt, network=False, errors=(*errors, ("no blur", still)))
             return self._with_work(plan)
 
         points, pupil = self._pupil(0.3 * budget)
