@@ -49,6 +49,7 @@ _RESERVE = 2.0  # dB kept in hand: a frame's own atmosphere is not the average o
 _SAMPLES = 300
 _FINE_PUPIL = 24
 _PATCH = 96  # pixels a side of the field on which the weights' grid is judged
+_FULL = 60  # components that a simulation without savings takes
 _COMPONENTS = (1, 2, 3, 5, 8, 10, 12, 16, 20, 25, 30, 40, 50, 60, 80, 100, MOST)
 
 
@@ -310,7 +311,14 @@ class Planner:
 
     def _with_work(self, plan: Plan) -> Plan:
         everything = replace(
-            plan, modes=MODES, blur=True, components=60, points=PUPIL, network=False, grid=1, factor=1, tilt=True
+            plan,
+            modes=max(MODES, plan.modes),
+            blur=True,
+            components=max(_FULL, plan.components),
+            network=False,
+            grid=1,
+            factor=1,
+            tilt=True,
         )
         own, full = self._work(plan), self._work(everything)
         return replace(plan, work=tuple((name, own[name], full[name]) for name in full))
