@@ -1,93 +1,98 @@
-"""Picture, tables and figures of docs/guide/simulate.md, from embedded pictures. Run from the top of the checkout."""
+"""Pictures and the table of wavelengths of docs/guide/simulate.md. Run from the top of the checkout."""
 
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.colors import hsv_to_rgb
 from PIL import Image, ImageDraw
 
-from turbnet.atmosphere.covariance import zernike_covariance
 from turbnet.atmosphere.path import OpticalPath
-from turbnet.atmosphere.profiles import Constant
 from turbnet.data.sources import embedded_paths, load_picture
+from turbnet.media.atomic import atomic_path
 from turbnet.media.colour import to_linear, to_srgb
-from turbnet.optics.psf import psf
-from turbnet.optics.pupil import circular, pupil_grid
-from turbnet.optics.superposition import scatter
-from turbnet.optics.zernike import zernike_basis
-from turbnet.simulate.blur import KERNEL, psf_basis, tilt_free_psf
-from turbnet.simulate.field import ZernikeField
 from turbnet.simulate.simulator import Simulator
-from turbnet.simulate.tilt import upsample
 
-IMAGES = Path("docs/images")
-PAIRS = ((2, 2), (3, 3), (4, 4), (2, 4), (2, 8), (4, 11))
-SEPARATIONS = (0, 8, 32, 128, 512)
+IMAGES, PAGE = Path("docs/images"), Path("docs/guide/simulate.md")
+BEGIN, END = "<!-- wavelengths: begin -->", "<!-- wavelengths: end -->"
+
+
+def astronaut(size: int) -> torch.Tensor:
+    """(3, size, size), sRGB."""
+    return torch.from_numpy(load_picture(embedded_paths("test")[0])[:size, 120 : 120 + size]).permute(2, 0, 1)
+
+
+def sheet(pictures: list[np.ndarray], titles: list[str], path: Path) -> None:
+    """Pictures (H, W, 3) in [0, 1] in a row under their titles."""
+    size = pictures[0].shape[0]
+    whole = Image.new("RGB", (len(pictures) * (size + 4) - 4, size + 16), "white")
+    for index, (picture, title) in enumerate(zip(pictures, titles, strict=True)):
+        whole.paste(Image.fromarray((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)), (index * (size + 4), 16))
+        ImageDraw.Draw(whole).text((index * (size + 4) + 2, 2), title, fill="black")
+    with atomic_path(path) as temporary:
+        whole.save(temporary, format="PNG", optimize=True)
 
 
 def strengths(size: int = 224) -> None:
     """One frame of the same atmosphere at four strengths."""
-    scene = torch.from_numpy(load_picture(embedded_paths("test")[0])[:size, 120 : 120 + size]).permute(2, 0, 1)
-    values = (1.0, 2.0, 3.0, 4.5)
-    sheet = Image.new("RGB", (len(values) * (size + 4) - 4, size + 16), "white")
-    for index, value in enumerate(values):
-        simulator = Simulator(OpticalPath.from_d_over_r0(value), size, size)
+    scene, values, frames = astronaut(size), (1.0, 2.0, 3.0, 4.5), []
+    for value in values:
+        simulator = Simulator(OpticalPath.from_d_over_r0(value), size, size, margin=64)
         seen = simulator(to_linear(scene)[None, None], simulator.draw([3]).centred())
-        frame = to_srgb(seen.frames[0, 0].clamp(0, 1)).permute(1, 2, 0).numpy()
-        sheet.paste(Image.fromarray((frame * 255 + 0.5).astype(np.uint8)), (index * (size + 4), 16))
-        ImageDraw.Draw(sheet).text((index * (size + 4) + 2, 2), f"D/r0 = {value}", fill="black")
+        frames.append(to_srgb(seen.frames[0, 0].clamp(0, 1)).permute(1, 2, 0).numpy())
+    sheet(frames, [f"D/r0 = {value}" for value in values], IMAGES / "strengths.png")
+
+
+def point_grid(size: int = 240) -> None:
+    """Points through the whole simulator, each with its own tilt and blur."""
+    values, pictures = (1.0, 3.0, 4.5), []
+    scene = torch.zeros(1, 1, 1, size, size)
+    scene[..., 12::24, 12::24] = 1.0
+    for value in values:
+        simulator = Simulator(OpticalPath.from_d_over_r0(value), size, size, margin=64, uniform=False, exact=True)
+        seen = simulator(scene, simulator.draw([5]).centred()).frames[0, 0, 0].clamp(min=0)
+        pictures.append(np.repeat((seen / seen.max()).sqrt().numpy()[..., None], 3, axis=2))
+    sheet(pictures, [f"D/r0 = {value}" for value in values], IMAGES / "point-grid.png")
+
+
+def tilt_map(size: int = 128, frames: int = 30) -> None:
+    """Tilts of a clip, hue by direction and brightness by length."""
+    simulator = Simulator(OpticalPath.from_d_over_r0(3.0), size, size)
+    draw = simulator.draw([1], frames, torch.tensor([2.0, 0.0]), frame_rate=20.0).centred()
+    x, y = simulator(torch.full((1, 1, 1, size, size), 0.5), draw).tilt[0].unbind(1)
+    length = torch.hypot(x, y)
+    hue = (torch.atan2(y, x) / (2 * torch.pi)) % 1
+    colours = hsv_to_rgb(torch.stack((hue, torch.ones_like(hue), (length / length.max()) ** 0.7), -1).numpy())
+    pictures = [Image.fromarray((colour * 255).astype(np.uint8)).quantize(64) for colour in colours]
+    with atomic_path(IMAGES / "tilt-map.gif") as temporary:
+        pictures[0].save(temporary, format="GIF", save_all=True, append_images=pictures[1:], duration=50, loop=0)
+
+
+def wavelengths(size: int = 192) -> str:
+    """Three wavelengths against one for all, as a table."""
+    scene = to_linear(astronaut(size))[None, None]
+    rows = ["| D/r0 | PSNR |", "|---|---|"]
+    for strength in (1.0, 3.0, 4.5):
+        path = OpticalPath.from_d_over_r0(strength, wavelength=535e-9)
+        one = Simulator(path, size, size, margin=64, exact=True, components=60)
+        three = Simulator(path, size, size, margin=64, exact=True, components=60, wavelengths=(620e-9, 535e-9, 460e-9))
+        draw = one.draw([0])
+        error = (three(scene, draw).frames - one(scene, draw).frames).square().mean()
+        rows.append(f"| {strength:g} | {-10 * torch.log10(error):.1f} dB |")
+    return "\n".join(rows)
+
+
+def main() -> None:
     IMAGES.mkdir(exist_ok=True)
-    sheet.save(IMAGES / "strengths.png", optimize=True)
-
-
-def covariance_table() -> None:
-    """What the field holds against quadrature."""
-    path = OpticalPath(0.2034, 7000.0, Constant(1e-15), 525e-9)
-    field = ZernikeField(path, 513, 513, modes=11)
-    print("| pair | " + " | ".join(f"{s} px" for s in SEPARATIONS) + " |")
-    print("|---" * (len(SEPARATIONS) + 1) + "|")
-    offsets = np.array(SEPARATIONS) * path.pixel
-    for i, j in PAIRS:
-        exact = zernike_covariance(path, i, j, offsets)
-        scale = np.sqrt(zernike_covariance(path, i, i, 0.0) * zernike_covariance(path, j, j, 0.0))
-        error = 100 * (field.covariance(i, j, np.array(SEPARATIONS)) - exact) / scale
-        print(f"| a{i} a{j} | " + " | ".join(f"{e:+.1f}" for e in np.ravel(error)) + " |")
-
-
-def fine_psfs(coefficients_PN: torch.Tensor, first: int, points: int, size: int) -> torch.Tensor:
-    """PSFs of a_first..a_36 from a pupil of `points` samples across, (P, size, size)."""
-    x, y = pupil_grid(points)
-    modes = torch.from_numpy(zernike_basis(range(first, 37), np.hypot(x, y), np.arctan2(y, x))).float()
-    pupil = torch.from_numpy(circular(points, subsamples=16)).float()
-    parts = [psf(torch.einsum("pn,nyx->pyx", c, modes), pupil, size) for c in coefficients_PN.split(512)]
-    return torch.cat(parts)
-
-
-def picture_error(size: int = 112, edge: int = 24, window: int = 47) -> None:
-    """PSNR of the simulator against dense scatter with whole PSFs, and what a uniform scene does without its division."""
-    scene = torch.from_numpy(load_picture(embedded_paths("test")[0])[100 : 100 + size, 150 : 150 + size, 0].copy())
-    print("\n| D/r0 | 10 components | 20 | 40 | uniform scene flickers by, if undivided | PSF against a finer pupil |")
-    print("|---|---|---|---|---|---|")
-    for strength in (1.0, 2.0, 3.0, 4.5, 6.0):
-        simulator = Simulator(OpticalPath.from_d_over_r0(strength), size, size, margin=0)
-        draw = simulator.draw([0])
-        fine = upsample(draw.coefficients[0], draw.stride, size, size)[0].flatten(1).T
-        whole = fine_psfs(fine, 2, 32, window).view(size, size, window, window)
-        uniform = scatter(torch.ones_like(scene), whole)
-        exact = scatter(scene, whole) / uniform
-        cells = []
-        for components in (10, 20, 40):
-            simulator.basis = psf_basis(components, strength, strength)
-            error = (simulator(scene[None, None, None], draw).frames[0, 0, 0] - exact)[edge:-edge, edge:-edge]
-            cells.append(f"{-10 * torch.log10(error.square().mean()):.1f} dB")
-        flicker = 100 * uniform[edge:-edge, edge:-edge].std()
-        points = fine[::97, 2:]
-        truth = fine_psfs(points, 4, 64, KERNEL)
-        relative = 100 * (tilt_free_psf(points) - truth).norm() / truth.norm()
-        print(f"| {strength} | " + " | ".join(cells) + f" | {flicker:.0f} % | {relative:.1f} % |")
+    with torch.no_grad():
+        strengths()
+        point_grid()
+        tilt_map()
+        table = wavelengths()
+    print(table)
+    head, rest = PAGE.read_text().split(BEGIN)
+    PAGE.write_text(f"{head}{BEGIN}\n\n{table}\n\n{END}{rest.split(END)[1]}")
 
 
 if __name__ == "__main__":
-    strengths()
-    covariance_table()
-    picture_error()
+    main()

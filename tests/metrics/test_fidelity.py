@@ -5,9 +5,10 @@ import pytest
 import skimage.data
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torchmetrics.image import MultiScaleStructuralSimilarityIndexMeasure
 
 from turbnet.errors import InputError
-from turbnet.metrics.fidelity import psnr, ssim
+from turbnet.metrics.fidelity import MS_SSIM_SIZE, ms_ssim, psnr, ssim
 
 SETTINGS = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
 
@@ -63,6 +64,38 @@ def test_tensors_and_a_still_reference(clips):
         assert isinstance(scores, torch.Tensor)
         np.testing.assert_array_equal(scores.numpy(), measure(*clips))
         assert measure(restored[None], reference[None]).shape == (1, 3)
+
+
+@pytest.fixture(scope="module")
+def large():
+    """Two photographs of MS_SSIM_SIZE + 5 pixels beside noisy copies, float64 (2, H, W, 3)."""
+    side = MS_SSIM_SIZE + 5
+    reference = np.stack(
+        [skimage.data.astronaut()[:side, 150 : 150 + side] / 255.0, skimage.data.coffee()[:side, :side] / 255.0]
+    )
+    noise = np.random.default_rng(0).normal(size=reference.shape)
+    return np.clip(reference + noise * np.array([0.02, 0.2])[:, None, None, None], 0, 1), reference
+
+
+@pytest.mark.parametrize("border", [0, 2])
+def test_ms_ssim_agrees_with_torchmetrics(large, border):
+    scores = ms_ssim(*large, border)
+    side = large[0].shape[1]
+    for score, restored, reference in zip(scores, *large, strict=True):
+        inner = np.s_[border : side - border, border : side - border]
+        pair = (torch.from_numpy(frame[inner]).movedim(-1, 0)[None] for frame in (restored, reference))
+        assert score == pytest.approx(
+            float(MultiScaleStructuralSimilarityIndexMeasure(data_range=1.0)(*pair)), abs=1e-5
+        )
+    assert scores[0] > scores[1]
+
+
+def test_ms_ssim_of_identical_and_of_small_frames(large):
+    np.testing.assert_allclose(ms_ssim(large[1], large[1]), 1.0, atol=1e-6)
+    with pytest.raises(InputError, match="NaN"):
+        ms_ssim(large[0] * np.nan, large[1])
+    with pytest.raises(InputError, match=f"at least {MS_SSIM_SIZE}x{MS_SSIM_SIZE} must remain"):
+        ms_ssim(large[0][:, 6:], large[1][:, 6:])
 
 
 @pytest.mark.parametrize("measure", [psnr, ssim])

@@ -160,9 +160,9 @@ def smooth_scene(size: int, highest: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("size", [160, 161])
 @pytest.mark.parametrize(("depth", "error"), [(0.0, 1e-5), (0.5, 5e-3)])
-def test_half_the_resolution_is_exact_below_its_nyquist_frequency(size, depth, error):
-    """With weights that are the same everywhere; others bring what bicubic interpolation has beyond 1/4 cycle a pixel."""
-    basis, scene = psf_basis(12, 3.0, 3.0), smooth_scene(size, 0.15)
+def test_half_the_resolution_is_exact_below_its_soft_edge(size, depth, error):
+    """To 0.21 cycles a pixel, with the same weights everywhere; others bring what bicubic interpolation has beyond."""
+    basis, scene = psf_basis(12, 3.0, 3.0), smooth_scene(size, 0.12)
     wave = torch.cos(2 * torch.pi / 80 * torch.arange(1 + -(-size // 4)) * 4.0)
     some = torch.randn(1, 12, 1, 1, generator=generator(1)) * basis.variance.sqrt()[:, None, None]
     weights = (some * (1 + depth * wave * wave[:, None])).double()
@@ -194,15 +194,15 @@ def test_tiles_are_the_whole(monkeypatch, size, stride):
     torch.testing.assert_close(blur(scene, weights, basis, stride), whole, rtol=0, atol=5e-6)
 
 
-def test_tiles_at_half_the_resolution_differ_by_less_than_half_the_resolution_does(monkeypatch):
-    """A piece ends sharply half a kernel away, which its low pass rings from."""
+def test_tiles_at_half_the_resolution_differ_by_far_less_than_half_the_resolution_does(monkeypatch):
+    """A piece ends sharply half a kernel away, from which its low pass rings a little."""
     weights, basis = field_weights(160, 3.0, 20)
     scene = torch.from_numpy(skimage.data.camera()[100:260, 200:360].copy()).float()[None, None] / 255
     full, half = (blur(scene, weights, basis, 4, factor) for factor in (1, 2))
     monkeypatch.setattr(blur_module, "_TILE", 64)
     monkeypatch.setattr(blur_module, "_PIECE", 48)
     tiles = blur(scene, weights, basis, 4, 2)
-    assert float((tiles - half).square().mean()) < 0.5 * float((half - full).square().mean())
+    assert float((tiles - half).square().mean()) < 0.1 * float((half - full).square().mean())
 
 
 @pytest.mark.parametrize("factor", [1, 2])

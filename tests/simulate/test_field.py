@@ -240,14 +240,14 @@ def test_drawn_flow_is_that_of_the_theory_at_every_lag():
         assert abs(float(products.mean()) - theory) < 4.5 * spread, lag
 
 
-def test_a_near_layer_does_not_come_back_after_whole_periods_of_the_grid(monkeypatch):
+def test_a_layer_does_not_come_back_after_a_period_of_the_grid(monkeypatch):
     """It would, were every wave to move with the frequency of its bin."""
-    flow = ZernikeField(SCENE, 64, 64, modes=4)
-    nearest = float(SCENE.layers(16)[0][0])
-    period = 2 * np.pi / flow._step[0] * nearest / SCENE.distance
-    way = period * np.ceil(0.5 / period)  # farther than the aperture is wide
+    flow = ZernikeField(SCENE, 128, 128, modes=4)
+    layer = 6
+    way = 2 * np.pi / flow._step[0] * float(SCENE.layers(16)[0][layer]) / SCENE.distance
+    assert way > 2 * SCENE.aperture
     seeds, strength = range(20), torch.zeros(20, 16)
-    strength[:, 0] = 1
+    strength[:, layer] = 1
 
     def change() -> float:
         """2 for one atmosphere and another, 0 for the same."""

@@ -58,9 +58,9 @@ def test_a_grid_of_a_region_reaches_past_its_last_pixel():
     assert len(part) == 1 + 6 - 2
 
 
-@pytest.mark.parametrize(("exact", "error"), [(True, 1e-5), (False, 2e-3)])
+@pytest.mark.parametrize(("exact", "error"), [(True, 1e-5), (False, 5e-4)])
 def test_flat_regions_stay_as_they_are_and_the_rest_is_that_of_the_whole(island, monkeypatch, exact, error):
-    """Components at half the resolution ring far from their edges, in the whole picture too: 3e-4 in its flat half."""
+    """Components at half the resolution ring a little from the edges of the region."""
     simulator = Simulator(OpticalPath.from_d_over_r0(2.0), *SIZE, modes=15, components=8, exact=exact)
     draw = simulator.draw([0, 1])
     cut = simulator(island, draw)

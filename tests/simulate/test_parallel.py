@@ -1,4 +1,5 @@
 import threading
+import time
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ def test_an_error_ends_the_work():
 
     def work(item: int) -> None:
         begun.append(item)
+        time.sleep(0.001)  # long enough for the news of the error to arrive before all is done
         if item == 1:
             raise ValueError("item 1")
 

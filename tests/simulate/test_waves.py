@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from turbnet.simulate.waves import grid_waves, held, low_waves
+from turbnet.simulate.waves import _LEVELS, grid_waves, held, low_waves
 
 STEP = (0.7, 1.3)  # dK along x and y, rad/m
 
@@ -12,7 +12,7 @@ STEP = (0.7, 1.3)  # dK along x and y, rad/m
 def test_cells_below_the_grid_tile_the_block_that_it_gives_up():
     """3 x 3 bins less the smallest block of all; a wave stands for a pair of cells."""
     waves = low_waves(STEP)
-    assert 2 * waves.area.sum() == pytest.approx((9 - 3.0**-8) * STEP[0] * STEP[1], rel=1e-12)
+    assert 2 * waves.area.sum() == pytest.approx((9 - 9.0**-_LEVELS) * STEP[0] * STEP[1], rel=1e-12)
     bins = grid_waves((16, 16), STEP)
     assert (~held(bins)).sum() == 6  # ky = -1, 0, 1 of kx = 0, 1
 

@@ -32,7 +32,7 @@ def test_version():
         (["improve"], "there is no command 'improve'"),
         (["--frobnicate"], "there is no command '--frobnicate'"),
         (["evaluate", "--frobnicate"], "--frobnicate"),
-        (["evaluate", "--restored", "a.png"], "--reference"),
+        (["evaluate", "--reference", "a.png"], "--restored"),
         (["evaluate", "--restored", "a.png", "--reference", "b.png", "--border", "wide"], "--border"),
         (["evaluate", "--restored", "a.png", "--reference", "b.png", "c.png"], "c.png"),
         (["evaluate", "--restored"], "--restored"),

@@ -5,8 +5,11 @@ import sys
 import numpy as np
 import pytest
 import skimage.data
+from scipy.ndimage import gaussian_filter, shift
 
 from turbnet import cli
+from turbnet.data.boxes import write_boxes
+from turbnet.data.text_scenes import render_scene
 from turbnet.media.clip import read_clip, write_clip
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.metrics.fidelity import psnr, ssim
@@ -29,9 +32,9 @@ def folder(tmp_path_factory):
     return folder
 
 
-def evaluate(folder, capsys, **clips):
+def evaluate(folder, capsys, *more, **clips):
     options = [text for name, value in clips.items() for text in (f"--{name}", str(folder / value))]
-    code = cli.run(["evaluate", *options, "--json", str(folder / "m.json"), "--border", "2"])
+    code = cli.run(["evaluate", *options, "--json", str(folder / "m.json"), "--border", "2", *more])
     printed = capsys.readouterr()
     assert (code, printed.err) == (0, "")
     document = json.loads((folder / "m.json").read_text())
@@ -65,6 +68,98 @@ def test_still_reference_stands_beside_every_frame(folder, capsys):
     assert rows["restored psnr"] == "inf"  # the first frame is the still
     assert rows["restored psnr worst"] == pytest.approx(expected.min(), rel=1e-5)
     assert rows["temporal mean frames"] == 1
+
+
+def test_a_fixed_shift_is_told_apart(folder, capsys):
+    """The picture moved by (1.5, -0.5) pixels: scored as it is, then with the shift undone."""
+    picture = skimage.data.chelsea()[50:131, 100:201] / 255.0
+    write_clip(folder / "straight.tif", np.stack([picture] * 2))
+    write_clip(folder / "shifted.tif", np.stack([shift(picture, (-0.5, 1.5, 0), order=3, mode="mirror")] * 2))
+    rows, _ = evaluate(folder, capsys, restored="shifted.tif", reference="straight.tif")
+    assert rows["restored shift x"] == pytest.approx(1.5, abs=0.05)
+    assert rows["restored shift y"] == pytest.approx(-0.5, abs=0.05)
+    assert rows["restored registered psnr"] > rows["restored psnr"] + 6
+    assert rows["restored registered ssim"] > rows["restored ssim"]
+    rows, _ = evaluate(folder, capsys, restored="straight.tif", reference="straight.tif")
+    assert rows["restored shift x"] == pytest.approx(0.0, abs=1e-6)
+    assert "restored registered psnr" not in rows
+
+
+def test_figures_without_a_reference(folder, capsys):
+    rows, table = evaluate(folder, capsys, restored="reference.mkv", input="input.tif")
+    # The picture moves by 0, 1, 2, 3 pixels across: sqrt(1.25) along x, none along y.
+    assert rows["restored jitter"] == pytest.approx(np.sqrt(1.25 / 2), rel=0.1)
+    assert rows["input noise"] > 5 * rows["restored noise"]
+    assert rows["restored sharpness of the mean"] < rows["restored sharpness"] < rows["input sharpness"]
+    assert rows["restored flicker"] < 0.01
+    assert "jitter" in table
+    still, _ = evaluate(folder, capsys, restored="still.png")
+    assert "restored jitter" not in still
+
+
+@pytest.fixture(scope="module")
+def texts(tmp_path_factory):
+    """A clip of sharp text and one of text blurred beyond reading, with one table for each way to name them."""
+    folder = tmp_path_factory.mktemp("texts")
+    scene = render_scene(np.random.default_rng(5), 120, 200, "words", size=(20, 20), contrast=(0.8, 0.9), perspective=0)
+    blurred = gaussian_filter(scene.picture, (6, 6, 0))
+    write_clip(folder / "sharp.tif", np.stack([scene.picture] * 2))
+    write_clip(folder / "blurred.tif", np.stack([scene.picture, blurred]))
+    write_boxes(folder / "one.tsv", {"any.tif": scene.boxes})
+    write_boxes(folder / "two.tsv", {"sharp.tif": scene.boxes, "blurred.tif": scene.boxes[:2]})
+    return folder, len(scene.boxes)
+
+
+def test_text_of_a_clip(texts, capsys):
+    folder, count = texts
+    rows, table = evaluate(folder, capsys, "--ocr", "proxy", restored="sharp.tif", input="blurred.tif", boxes="one.tsv")
+    assert rows["restored text words"] == rows["input text words"] == count
+    assert rows["restored text cer"] < 0.3
+    assert rows["input text cer worst"] > 0.8
+    assert rows["input text cer worst frame"] == 1
+    assert rows["restored text cer"] < rows["input text cer of the mean"]
+    assert rows["restored text words read"] == pytest.approx(count * rows["restored text word accuracy"])
+    assert "word accuracy" in table
+
+
+def test_text_of_the_files_a_table_names(texts, capsys):
+    folder, count = texts
+    rows, _ = evaluate(folder, capsys, "--ocr", "builtin", transcripts="two.tsv")
+    assert rows["sharp.tif text words"] == count
+    assert rows["blurred.tif text words"] == 2
+    assert rows["all text words"] == count + 2
+    assert rows["sharp.tif text cer"] < 0.15
+    assert rows["blurred.tif text cer worst"] > 0.5
+    assert rows["all text words read worst frame"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "give --restored, the clip to score, or --boxes"),
+        (["--boxes", "two.tsv", "--input", "sharp.tif"], "give --restored"),
+        (["--boxes", "none.tsv"], "cannot read the boxes none.tsv"),
+        (["--boxes", "one.tsv"], "there is no file or folder any.tif"),
+        (["--boxes", "two.tsv", "--ocr", "eagle"], "there is no reader eagle; choose one of builtin, rapidocr"),
+        (["--boxes", "two.tsv", "--restored", "other.png"], "two.tsv has no boxes for other.png"),
+        (["--boxes", "one.tsv", "--restored", "other.png", "--ocr", "proxy"], "does not lie inside the picture"),
+    ],
+)
+def test_bad_text_input_is_one_line(texts, capsys, monkeypatch, arguments, says):
+    monkeypatch.chdir(texts[0])
+    write_clip("other.png", np.full((1, 30, 30, 3), 0.5))
+    code = cli.run(["evaluate", "--quiet", *arguments])
+    printed = capsys.readouterr()
+    assert (code, printed.out) == (2, "")
+    assert says in printed.err
+    assert printed.err.count("\n") == 1
+
+
+def test_the_extra_is_named_when_it_is_missing(texts, capsys, monkeypatch):
+    monkeypatch.chdir(texts[0])
+    monkeypatch.setitem(sys.modules, "rapidocr", None)
+    assert cli.run(["evaluate", "--boxes", "two.tsv", "--ocr", "rapidocr", "--quiet"]) == 2
+    assert "needs the extra 'ocr': pip install 'turbnet[ocr]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

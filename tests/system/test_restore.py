@@ -148,6 +148,10 @@ def bad_files(model, tmp_path_factory) -> Path:
         ("good.tiff -o out.tiff --model none.onnx", "no model"),
         ("good.tiff -o out.tiff --model damaged.onnx", "damaged.onnx: the file is damaged or was changed"),
         ("good.tiff -o out.tiff --model foreign.onnx", "foreign.onnx: not a turbnet model"),
+        ("good.tiff -o out.tiff --method magic", "there is no method magic; the methods are pipeline"),
+        ("good.tiff -o out.tiff --method mean --model good.onnx", "not both"),
+        ("good.tiff -o out.tiff --method pipeline --window 1", "a single one"),
+        ("nan.tiff -o out.tiff --method mean", "NaN"),
         ("good.tiff -o out.tiff --model text.onnx", "text.onnx: not a turbnet model"),
         ("good.tiff -o none/out.tiff --model good.onnx", "none"),
         ("good.tiff -o out.xyz --model good.onnx", "out.xyz"),
@@ -181,6 +185,20 @@ def test_an_output_that_exists_survives_a_failure(bad_files, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+def test_a_classical_method_in_place_of_a_model(tmp_path):
+    frames_THWC = moving_clip(1, 48, 56).repeat(5, axis=0)
+    noisy_THWC = frames_THWC + 0.02 * np.random.default_rng(0).standard_normal(frames_THWC.shape)
+    source = write(tmp_path / "in.tiff", noisy_THWC.clip(0, 1).astype(np.float32))
+    for method in ("mean", "pipeline"):
+        target, report = tmp_path / f"{method}.tiff", tmp_path / "report.json"
+        done = turbnet("restore", source, "-o", target, "--method", method, "--threads", 2, "--json", report)
+        assert done.returncode == 0, done.stderr
+        assert "5 frames of 56x48" in done.stdout
+        assert {row["name"]: row["value"] for row in json.loads(report.read_text())["rows"]}["window"] == 5
+        error = np.abs(read(target) - frames_THWC).mean()
+        assert error < 0.7 * np.abs(read(source) - frames_THWC).mean()
+
+
 def test_starts_without_torch(model, tmp_path):
     source = write(tmp_path / "in.tiff", moving_clip(2, 32, 32))
     words = ["restore", str(source), "-o", str(tmp_path / "out.tiff"), "--model", str(model), "--quiet"]
@@ -195,5 +213,5 @@ def test_starts_without_torch(model, tmp_path):
 def test_help():
     done = turbnet("restore", "--help")
     assert done.returncode == 0
-    for option in ("--output", "--model", "--crop", "--window", "--tile", "--threads", "--json", "--quiet"):
+    for option in ("--output", "--model", "--method", "--crop", "--window", "--tile", "--threads", "--json", "--quiet"):
         assert option in done.stdout

@@ -66,6 +66,43 @@ def test_frames_of_a_wind_are_coherent_and_independent_ones_are_not(tmp_path, ph
     assert jumps[0] < 0.5 * jumps[1]
 
 
+def test_a_camera_s_whole_chain(tmp_path, photo):
+    """Pixel pitch, colours, exposures, boiling air, outer scale, compression: together and reproducible."""
+    camera = ("--focal-length", 2, "--pixel-pitch", 4e-6, "--wavelengths", "620e-9,535e-9,460e-9", "--jpeg", 60)
+    air = ("--d-over-r0", 2, "--boiling", 0.5, "--outer-scale", 5, "--wind-direction", 90)
+    for name in ("a.mkv", "b.mkv"):
+        more = ("--frames", 2, "--exposures", 3, "--shutter", 0.5, "--bits", 8, "--truth", f"truth-{name}")
+        done = simulate(tmp_path, photo, "-o", name, *camera, *air, *more)
+        assert done.returncode == 0, done.stderr
+    # q = 2 D p / (lambda f) = 1.55 Nyquist pixels of 9.03 mm.
+    assert "0.014 m" in done.stdout
+    np.testing.assert_array_equal(read_clip(tmp_path / "a.mkv")[0], read_clip(tmp_path / "b.mkv")[0])
+    strength = np.load(tmp_path / "truth-a.mkv/blur_strength.npy")
+    assert strength.shape == (2, 57, 63)
+    # sqrt of 0.134 (D/r0)^(5/3) less what modes beyond 36 hold; one small patch scatters about it.
+    assert 0.2 < strength.mean() < 1.2
+
+
+def test_the_plan_is_printed_and_nothing_written(tmp_path, photo):
+    done = simulate(tmp_path, photo, "--plan", "--d-over-r0", 1)
+    assert done.returncode == 0, done.stderr
+    assert "of the work saved" in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_clip_like_another(tmp_path):
+    scene = Image.fromarray(skimage.data.astronaut()[:128, 160:288])
+    scene.save(tmp_path / "scene.png")
+    made = simulate(
+        tmp_path, "scene.png", "-o", "real.mkv", "--d-over-r0", 2, "--frames", 40, "--independent", "--quiet"
+    )
+    assert made.returncode == 0, made.stderr
+    done = simulate(tmp_path, "scene.png", "-o", "like.mkv", "--like", "real.mkv", "--frames", 1, "--json", "path.json")
+    assert done.returncode == 0, done.stderr
+    rows = {row["name"]: row for row in json.loads((tmp_path / "path.json").read_text())["rows"]}
+    assert rows["D/r0"]["value"] == pytest.approx(2.0, rel=0.15)
+
+
 def test_a_grey_clip_stays_grey_and_keeps_its_frames(tmp_path):
     rng = np.random.default_rng(0)
     grey = np.repeat(rng.random((3, 24, 20, 1), dtype=np.float32), 3, axis=3)
@@ -86,6 +123,16 @@ def test_a_grey_clip_stays_grey_and_keeps_its_frames(tmp_path):
         (("PHOTO", "-o", "out.mkv", "--wavelength", "525"), "wavelength"),
         (("PHOTO", "-o", "out.mkv", "--cn2", "1e-15", "--d-over-r0", "2"), "not both"),
         (("PHOTO", "-o", "out.mkv", "--frames", "0"), "frames"),
+        (("PHOTO",), "-o"),
+        (("PHOTO", "-o", "out.mkv", "--focal-length", "2"), "--pixel-pitch"),
+        (("PHOTO", "-o", "out.mkv", "--focal-length", "2", "--pixel-pitch", "4"), "pixel pitch"),
+        (("PHOTO", "-o", "out.mkv", "--wavelengths", "620,535"), "--wavelengths"),
+        (("PHOTO", "-o", "out.mkv", "--wavelengths", "620,535,460"), "wavelength"),
+        (("PHOTO", "-o", "out.mkv", "--exposures", "0"), "exposures"),
+        (("PHOTO", "-o", "out.mkv", "--jpeg", "101"), "jpeg"),
+        (("PHOTO", "-o", "out.mkv", "--boiling", "0"), "boiling"),
+        (("PHOTO", "-o", "out.mkv", "--tolerance", "200"), "tolerance"),
+        (("PHOTO", "-o", "out.mkv", "--like", "PHOTO"), "frames"),
         (("PHOTO", "-o", "out.mkv", "--crop", "1,2,3"), "--crop"),
         (("PHOTO", "-o", "out.mkv", "--crop", "0,0,1000,1000"), "crop"),
         (("PHOTO", "-o", "out.mkv", "--frobnicate"), "frobnicate"),

@@ -218,6 +218,17 @@ def test_two_processes_take_the_step_of_one(command, tmp_path, experiment):
         )
 
 
+def interrupt(process: subprocess.Popen[str], patience: float = 10) -> str:
+    """What it says on standard error; Ctrl-C again where Python drops one, as it does inside a destructor."""
+    for _ in range(6):
+        process.send_signal(signal.SIGINT)
+        try:
+            return process.communicate(timeout=patience)[1]
+        except subprocess.TimeoutExpired:
+            continue
+    raise AssertionError("it goes on")
+
+
 def test_an_interrupted_run_says_so_and_leaves_a_checkpoint_to_resume_from(tmp_path):
     arguments = [*SECONDS, "trainer.max_epochs=100000", "output=run"]
     whole = [sys.executable, "-m", "turbnet", "train", *arguments]
@@ -227,8 +238,7 @@ def test_an_interrupted_run_says_so_and_leaves_a_checkpoint_to_resume_from(tmp_p
             until = time.monotonic() + 120
             while not last.exists() and process.poll() is None and time.monotonic() < until:
                 time.sleep(0.2)
-            process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=60)
+            err = interrupt(process)
         finally:
             process.kill()
     assert process.returncode == 130, err

@@ -4,7 +4,7 @@ The reference takes its PSFs from `turbnet.optics.psf` (a matrix DFT of a pupil 
 phase ramp, 47 x 47 pixels), not from the simulator; coefficients are interpolated to every pixel.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -72,20 +72,22 @@ def decibel(error: float) -> float:
     return float(-10 * np.log10(error))
 
 
-def measure(track: Track) -> list[Row]:
+def measure(track: Track, strengths: Sequence[float] = STRENGTHS, seeds: Sequence[int] = SEEDS) -> list[Row]:
     """Rows of the family; `track(name, count)` yields once a strength and may show progress."""
     rows = []
-    for index in track("pictures", len(STRENGTHS)):
-        strength = STRENGTHS[index]
+    for index in track("pictures", len(strengths)):
+        strength = strengths[index]
         simulator = Simulator(OpticalPath.from_d_over_r0(strength), SIZE, SIZE, margin=0)
         found = []
-        for seed in SEEDS:
+        for seed in seeds:
             draw = simulator.draw([seed])
             found += errors(simulator, draw, exact_pictures(draw))
         name = f"picture, D/r0 = {strength:g}: PSNR against dense scatter"
         value = decibel(float(np.mean(found)))
-        what = f"{len(PICTURES)} pictures, {len(SEEDS)} draws"
-        rows.append(Row(f"{name}, {what} together (at least {TOLERANCE:g})", value, "dB", TOLERANCE, 0.0, value >= TOLERANCE))
+        what = f"{len(PICTURES)} pictures, {len(seeds)} draws"
+        rows.append(
+            Row(f"{name}, {what} together (at least {TOLERANCE:g})", value, "dB", TOLERANCE, 0.0, value >= TOLERANCE)
+        )
         rows.append(Row(f"{name}, the worst of them", decibel(max(found)), "dB"))
         rows.append(Row(f"picture, D/r0 = {strength:g}: PSNR that the plan expected", simulator.plan().expected, "dB"))
     return rows + _limits() + _phase_to_space()
@@ -103,7 +105,9 @@ def _limits() -> list[Row]:
         points[..., SIZE // 2 - 8 : SIZE // 2 + 9 : 8, SIZE // 2 - 8 : SIZE // 2 + 9 : 8] = 1.0
         frames = simulator(points, simulator.draw(range(4))).frames
         worst = float((frames.sum((2, 3, 4)) / points.sum() - 1).abs().max())
-        rows.append(Row(f"energy of points, D/r0 = {strength:g}: largest relative change", worst, "", 0.0, 1e-4, worst <= 1e-4))
+        rows.append(
+            Row(f"energy of points, D/r0 = {strength:g}: largest relative change", worst, "", 0.0, 1e-4, worst <= 1e-4)
+        )
     return rows
 
 

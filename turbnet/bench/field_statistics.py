@@ -8,13 +8,13 @@ import torch
 
 from turbnet.atmosphere.covariance import drift_covariance, zernike_covariance
 from turbnet.atmosphere.path import OpticalPath
-from turbnet.atmosphere.profiles import Array, Constant, Tabulated
+from turbnet.atmosphere.profiles import Array, Constant, Profile, Tabulated
 from turbnet.report import Row
 from turbnet.simulate.field import ZernikeField
 
 Track = Callable[[str, int], Iterable[int]]
 
-PATHS = {
+PATHS: dict[str, Profile] = {
     "constant Cn2": Constant(1e-15),
     "Cn2 falling towards the scene": Tabulated((0, 7000), (2e-15, 0)),
     "Cn2 rising towards the scene": Tabulated((0, 7000), (0, 2e-15)),
@@ -48,10 +48,12 @@ def measure(draws: int, track: Track) -> list[Row]:
         for mode, letter in ((0, "a2"), (1, "a3")):
             theory = exact[mode, mode, -1] / exact[mode, mode, 0]
             edge = drawn[mode, mode, -1] / drawn[mode, mode, 0]
-            rows.append(Row.compared(f"field, {name}: correlation of {letter} at opposite edges, 512 px", edge, theory, 0.06))
+            rows.append(
+                Row.compared(f"field, {name}: correlation of {letter} at opposite edges, 512 px", edge, theory, 0.06)
+            )
         worst = max((_drift_error(field, mode, way) for mode, way in product((2, 3), TRAVEL)), key=abs)
         rows.append(Row.compared(f"field, {name}: worst error of the tilts' autocorrelation, held", worst, 0.0, 0.05))
-    rows += _drawn_drift(max(draws // 8, 20), track)
+    rows += _drawn_drift(max(draws // 3, 20), track)
     return rows
 
 
@@ -79,7 +81,7 @@ def _drift_error(field: ZernikeField, mode: int, way: float) -> float:
 def _drawn_drift(draws: int, track: Track) -> list[Row]:
     """The tilts' autocorrelation of drawn clips, against theory within 5 % or three standard errors."""
     path = OpticalPath(0.2034, 7000.0, PATHS["constant Cn2"], 525e-9)
-    field = ZernikeField(path, 125, 125, modes=3, stride=16)
+    field = ZernikeField(path, 125, 125, modes=3, stride=STRIDE)
     products = np.zeros((draws, len(TRAVEL), 2))
     squares = np.zeros((draws, 2))
     for seed in track("field, frozen flow", draws):

@@ -3,13 +3,17 @@
 import importlib
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from turbnet.cli.typed import run_typed
 
-SUITES = {"physics": "optics, atmosphere and split-step against theory"}
+SUITES = {
+    "physics": "optics, atmosphere and split-step against theory",
+    "simulator": "the in-loop simulator: exactness, speed, run time against error",
+    "restoration": "methods, models and commands over the frozen benchmark",
+}
 
 
 def main(arguments: list[str]) -> int:
@@ -32,14 +36,81 @@ def physics(
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
 ) -> int:
     """Measure screens, split-step propagation and speed against theory; exit code 1 if a row misses its tolerance."""
+    _check_outputs(json, figures)
+    bench = importlib.import_module("turbnet.bench.physics")
+    return _finish(bench, bench.run(quick=quick, quiet=quiet), json, figures)
+
+
+def simulator(
+    json: Annotated[Path | None, typer.Option(help="write the rows to this file")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="write the figure of run time against error into this folder")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(help="families to measure, of field,picture,split-step,speed,curve; comma-separated")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="fewer draws: a minute or two, wide error bars")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
+) -> int:
+    """Measure the in-loop simulator; exit code 1 if a row misses its limit."""
+    from turbnet.errors import InputError
+
+    _check_outputs(json, figures)
+    bench = importlib.import_module("turbnet.bench.simulator")
+    families = bench.FAMILIES if only is None else tuple(only.split(","))
+    unknown = [name for name in families if name not in bench.FAMILIES]
+    if unknown:
+        raise InputError(f"--only {only}: there is no family {unknown[0]!r}; they are {', '.join(bench.FAMILIES)}")
+    return _finish(bench, bench.run(families, quick=quick, quiet=quiet), json, figures)
+
+
+def restoration(
+    suite: Annotated[str, typer.Option(help="standard, or quick: one scene of each kind at one strength")] = "standard",
+    method: Annotated[list[str] | None, typer.Option(help="classical method; may be given again")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="released network or ONNX file; may be given again")] = None,
+    external: Annotated[
+        list[str] | None, typer.Option(help="command with {in} and {out} where the clips go; may be given again")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="write the rows to this file")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="write the tables to this file")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="write the figure of run time against error into this folder")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
+) -> int:
+    """Restore the frozen benchmark with all methods and released models, or with those that are named."""
+    from turbnet.errors import InputError
+    from turbnet.media.atomic import atomic_path
+
+    _check_outputs(json, figures)
+    _check_outputs(markdown, None)
+    bench = importlib.import_module("turbnet.bench.restoration")
+    if suite not in bench.SUITES:
+        raise InputError(f"there is no suite {suite}; the suites are {', '.join(bench.SUITES)}")
+    results = bench.run(bench.entrants(method or (), model or (), external or ()), suite, quiet)
+    tables = bench.table(results)
+    print(tables)
+    if markdown is not None:
+        with atomic_path(markdown) as temporary:
+            temporary.write_text(tables + "\n")
+    if figures is not None:
+        figures.mkdir(parents=True, exist_ok=True)
+        bench.draw_figure(results, figures / "restoration-time-error.png")
+    if json is not None:
+        bench.report(results).write(json)
+    return 0
+
+
+def _check_outputs(json: Path | None, figures: Path | None) -> None:
     from turbnet.errors import InputError
 
     if json is not None and not json.parent.is_dir():
         raise InputError(f"cannot write {json}: the folder {json.parent} does not exist; create it first")
     if figures is not None and figures.exists() and not figures.is_dir():
         raise InputError(f"cannot write figures into {figures}: it is a file; name a folder")
-    bench = importlib.import_module("turbnet.bench.physics")
-    found = bench.run(quick=quick, quiet=quiet)
+
+
+def _finish(bench: Any, found: Any, json: Path | None, figures: Path | None) -> int:
     print(found.text)
     if figures is not None:
         bench.draw_figures(found.panels, figures)

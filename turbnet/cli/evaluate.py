@@ -1,8 +1,6 @@
-"""`turbnet evaluate`: PSNR and SSIM of a restored clip against its reference, beside those of its input."""
+"""`turbnet evaluate`: how good a restored clip is, by its reference, by itself, by the text in it."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from itertools import zip_longest
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,15 +10,10 @@ from turbnet.cli.typed import run_typed
 from turbnet.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-    from rich.progress import Progress
     from rich.table import Table
 
     from turbnet.media.clip import ClipReader
-    from turbnet.report import Row
-
-    Frame = NDArray[np.float32]
+    from turbnet.metrics.evaluation import ClipScores, Watch
 
 
 def main(arguments: list[str]) -> int:
@@ -28,14 +21,28 @@ def main(arguments: list[str]) -> int:
 
 
 def evaluate(
-    restored: Annotated[Path, typer.Option(metavar="CLIP", help="The clip to score.")],
-    reference: Annotated[Path, typer.Option(metavar="CLIP", help="What it should be: a clip or one still.")],
+    restored: Annotated[Path | None, typer.Option(metavar="CLIP", help="The clip to score.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(metavar="CLIP", help="What it should be: a clip or one still.")
+    ] = None,
     input: Annotated[Path | None, typer.Option(metavar="CLIP", help="What it was restored from: scored too.")] = None,
+    boxes: Annotated[
+        Path | None,
+        typer.Option("--boxes", "--transcripts", metavar="TSV", help="Text in the clips: boxes and transcripts."),
+    ] = None,
+    ocr: Annotated[
+        str, typer.Option(metavar="READER", help="Who reads it: builtin, rapidocr, rapidocr-find or proxy.")
+    ] = "builtin",
     border: Annotated[int, typer.Option(metavar="PIXELS", help="Left out at each edge.")] = 0,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the figures to this file as well.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
-    """Score a restored clip: PSNR and SSIM of the values in the files, mean over the frames and worst frame.
+    """Score a restored clip: mean over the frames and worst frame.
+
+    With --reference: PSNR, SSIM and MS-SSIM of the values in the files, and how far the whole is shifted. Without:
+    jitter, flicker, sharpness, noise, as for real clips of still scenes. With --boxes: how much of the text is read. The
+    table has the columns file, left, top, width, height, text, with tabs between; it may be given alone, for the files
+    it names (relative to its folder), or with clips, whose names then need not agree if it names a single file.
 
     CLIP is an image, a folder of images, a video, a GIF or a multi-page TIFF. With --input, the input's frames and
     their mean over time, taken in linear light, are scored beside the restored ones.
@@ -49,109 +56,101 @@ def evaluate(
 
     if json:
         check_output(json)
-    clips = [open_clip(path) for path in (restored, reference, input) if path]
-    target = clips[1]
-    for clip in clips:
-        if (clip.info.height, clip.info.width) != (target.info.height, target.info.width):
+    if restored is None and (boxes is None or reference or input):
+        raise InputError("give --restored, the clip to score, or --boxes, a table of the files to read text in")
+    clips = {name: open_clip(path) for name, path in (("restored", restored), ("input", input)) if path}
+    target = open_clip(reference) if reference else None
+    for clip in clips.values():
+        if target and (clip.info.height, clip.info.width) != (target.info.height, target.info.width):
             raise InputError(f"{_size(clip)} but {_size(target)}; both must have one size")
 
-    scores = []
+    scores: list[ClipScores] = []
     with progress_bar(quiet) as progress:
-        scores.append(_score("restored", _pairs(clips[0], target), border, clips[0], progress))
-        if input:
-            mean = _TemporalMean()
-            scores.append(_score("input", mean.watch(_pairs(clips[2], target)), border, clips[2], progress))
-            still = mean.frame()
-            scores.append(_score("temporal mean", ((still, frame) for frame in target), border, target, progress))
+
+        def watch(total: int | None) -> "Watch":
+            def track(items: Iterable[Any], description: str) -> Iterable[Any]:
+                return progress.track(items, total=total, description=description)
+
+            return track
+
+        for name, clip in clips.items():
+            scores += _scores(name, clip, target, border, watch(clip.info.frames))
+        if boxes:
+            scores += _texts(clips, boxes, ocr, watch)
 
     Console().print(_table(scores))
     if json:
         Report([row for score in scores for row in score.rows()]).write(json)
 
 
-@dataclass
-class _Scores:
-    """The figures of one clip, frame by frame."""
+def _scores(
+    name: str, clip: "ClipReader", target: "ClipReader | None", border: int, watch: "Watch"
+) -> "list[ClipScores]":
+    from turbnet.metrics.evaluation import TemporalMean, against_reference, pairs, without_reference
 
-    name: str
-    psnr: list[float] = field(default_factory=list)
-    ssim: list[float] = field(default_factory=list)
-
-    def measures(self) -> Iterator[tuple[str, str, float, float, int]]:
-        """Measure, unit, mean over the frames, the worst frame's value and its index."""
-        for measure, unit, values in (("psnr", "dB", self.psnr), ("ssim", "", self.ssim)):
-            worst = min(values)
-            yield measure, unit, sum(values) / len(values), worst, values.index(worst)
-
-    def rows(self) -> "Iterator[Row]":
-        from turbnet.report import Row
-
-        yield Row(f"{self.name} frames", len(self.psnr))
-        for measure, unit, mean, worst, index in self.measures():
-            yield Row(f"{self.name} {measure}", mean, unit)
-            yield Row(f"{self.name} {measure} worst", worst, unit)
-            yield Row(f"{self.name} {measure} worst frame", index)
-
-
-class _TemporalMean:
-    """Mean over time of the frames that pass by, in linear light, as a long exposure would take it."""
-
-    def __init__(self) -> None:
-        self._sum: Any = 0.0
-        self._count = 0
-
-    def watch(self, pairs: "Iterable[tuple[Frame, Frame]]") -> "Iterator[tuple[Frame, Frame]]":
-        from turbnet.media.colour import to_linear
-
-        for frame, reference in pairs:
-            self._sum = self._sum + to_linear(frame.astype("float64"))
-            self._count += 1
-            yield frame, reference
-
-    def frame(self) -> "Frame":
-        from turbnet.media.colour import to_srgb
-
-        return to_srgb(self._sum / self._count).astype("float32")
-
-
-def _pairs(clip: "ClipReader", target: "ClipReader") -> "Iterator[tuple[Frame, Frame]]":
-    """Each frame with its reference; a reference of one frame stands beside every frame."""
-    if target.info.frames == 1:
-        still = next(iter(target))
-        yield from ((frame, still) for frame in clip)
-        return
-    for index, (frame, reference) in enumerate(zip_longest(clip, target)):
-        if frame is None or reference is None:
-            shorter, longer = (clip, target) if frame is None else (target, clip)
-            raise InputError(f"{shorter.path} ends after {index} frames but {longer.path} has more; cut one to match")
-        yield frame, reference
-
-
-def _score(
-    name: str, pairs: "Iterable[tuple[Frame, Frame]]", border: int, clip: "ClipReader", progress: "Progress"
-) -> _Scores:
-    from turbnet.metrics.fidelity import psnr, ssim
-
-    scores = _Scores(name)
-    for frame, reference in progress.track(pairs, total=clip.info.frames, description=name):
-        scores.psnr.append(float(psnr(frame, reference, border)))
-        scores.ssim.append(float(ssim(frame, reference, border)))
+    if target is None:
+        return [without_reference(name, clip, watch)]
+    scores = [against_reference(name, lambda: pairs(clip, target), border, watch)]
+    if name == "input":
+        mean = TemporalMean()
+        for frame in clip:
+            mean.add(frame)
+        still = mean.frame()
+        scores.append(against_reference("temporal mean", lambda: ((still, frame) for frame in target), border, watch))
     return scores
+
+
+def _texts(
+    clips: "dict[str, ClipReader]", table: Path, ocr: str, watch: "Callable[[int | None], Watch]"
+) -> "list[ClipScores]":
+    """What is read in the clips, or in the files that the table names."""
+    from turbnet.data.boxes import read_boxes
+    from turbnet.media.clip import open_clip
+    from turbnet.metrics.evaluation import read_texts, text_scorer
+
+    boxes = read_boxes(table)
+    if clips:
+        for clip in clips.values():
+            if len(boxes) > 1 and clip.path.name not in map(_name, boxes):
+                raise InputError(f"{table} has no boxes for {clip.path.name}")
+        named = {_name(file): rows for file, rows in boxes.items()}
+        only = next(iter(named.values()))
+        work = [(name, clip, named.get(clip.path.name, only)) for name, clip in clips.items()]
+    else:
+        work = [(_name(file), open_clip(table.parent / file), rows) for file, rows in boxes.items()]
+    scorer = text_scorer(ocr)
+    read = {name: read_texts(name, clip, rows, scorer, watch(clip.info.frames)) for name, clip, rows in work}
+    scores = [figures.scores(f"{name} text") for name, figures in read.items()]
+    if not clips and len(read) > 1:
+        first, *others = read.values()
+        scores.append(sum(others, first).scores("all text"))
+    return scores
+
+
+def _name(file: str) -> str:
+    return Path(file).name
 
 
 def _size(clip: "ClipReader") -> str:
     return f"{clip.path} is {clip.info.width}x{clip.info.height} pixels"
 
 
-def _table(scores: list[_Scores]) -> "Table":
+def _table(scores: "list[ClipScores]") -> "Table":
     from rich.table import Table
 
-    table = Table()
-    table.add_column("")
-    for heading in ("frames", "PSNR dB", "worst", "frame", "SSIM", "worst", "frame"):
-        table.add_column(heading, justify="right")
+    table = Table("", "frames", "measure", "mean", "worst", "frame")
+    for column in table.columns[3:]:
+        column.justify = "right"
     for score in scores:
-        (_, _, psnr, psnr_worst, psnr_at), (_, _, ssim, ssim_worst, ssim_at) = score.measures()
-        figures = [f"{psnr:.2f}", f"{psnr_worst:.2f}", str(psnr_at), f"{ssim:.4f}", f"{ssim_worst:.4f}", str(ssim_at)]
-        table.add_row(score.name, str(len(score.psnr)), *figures)
+        for index, figure in enumerate(score.figures):
+            digits = 2 if figure.unit == "dB" else 4
+            worst, frame = figure.worst
+            table.add_row(
+                "" if index else score.name,
+                "" if index else str(score.frames),
+                f"{figure.measure} {figure.unit}".strip(),
+                f"{figure.mean:.{digits}f}",
+                *((f"{worst:.{digits}f}", str(frame)) if figure.per_frame else ("", "")),
+                end_section=index == len(score.figures) - 1,
+            )
     return table

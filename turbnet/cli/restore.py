@@ -16,7 +16,12 @@ def main(arguments: list[str]) -> int:
 def restore(
     source: Annotated[Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video or TIFF")],
     output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what")],
-    model: Annotated[str, typer.Option(help="a released model by name, or an ONNX file of turbnet export")] = "small",
+    model: Annotated[
+        str | None, typer.Option(help="a released model by name, or an ONNX file of turbnet export; default: small")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="a method without learning in place of a model: pipeline, ...")
+    ] = None,
     crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
     tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 384,
@@ -26,18 +31,22 @@ def restore(
 ) -> None:
     """Restore a clip or an image seen through turbulence."""
     from turbnet.cli.options import parse_crop
+    from turbnet.deploy.method import ClassicalMethod
     from turbnet.deploy.restore import restore_clip
     from turbnet.deploy.session import Model
     from turbnet.deploy.weights import find_model
+    from turbnet.errors import InputError
     from turbnet.media.atomic import check_output
     from turbnet.report import Report, Row
 
+    if model and method:
+        raise InputError("give --model or --method, not both")
     if json:
         check_output(json)
     done = restore_clip(
         source,
         output,
-        Model.load(find_model(model), threads),
+        ClassicalMethod(method, threads) if method else Model.load(find_model(model or "small"), threads),
         crop=parse_crop(crop),
         tile=tile,
         window=window,

@@ -1,10 +1,11 @@
 """The model card: what a network states about itself, kept inside its ONNX file and beside it."""
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from turbnet._version import __version__
 from turbnet.deploy.seal import UNSEALED
@@ -14,8 +15,72 @@ from turbnet.media.atomic import atomic_path
 PREFIX = "turbnet."
 
 
+class Card(ABC):
+    """What every card does; the dataclasses below say what stands on one."""
+
+    config: dict[str, Any]
+    seed: int | None
+    notes: dict[str, Any]
+    version: str
+    sha256: str
+
+    @abstractmethod
+    def rows(self) -> list[tuple[str, Any]]:
+        """Name and value of what stands on this kind of card alone, for people."""
+
+    def _values(self) -> dict[str, Any]:
+        return asdict(self)  # type: ignore[call-overload]
+
+    def to_metadata(self) -> dict[str, str]:
+        """The card as ONNX `metadata_props`: keys `turbnet.<field>`, values JSON, the digest bare."""
+        values = {name: json.dumps(value, allow_nan=False) for name, value in self._values().items()}
+        return {PREFIX + name: value for name, value in (values | {"sha256": self.sha256}).items()}
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> Self:
+        """The card in a file's metadata.
+
+        Raises:
+            InputError: a field is missing or is not what this version of turbnet writes.
+        """
+        try:
+            values = {item.name: metadata[PREFIX + item.name] for item in fields(cls)}  # type: ignore[arg-type]
+            sha256 = values.pop("sha256")
+            return cls(**{name: json.loads(value) for name, value in values.items()} | {"sha256": sha256})
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"the model card cannot be read by turbnet {__version__} ({error}); "
+                f"it was written by turbnet {metadata.get(PREFIX + 'version', 'of unknown version')}"
+            ) from error
+
+    def to_json(self) -> str:
+        return json.dumps(self._values(), indent=2) + "\n"
+
+    def to_markdown(self, title: str) -> str:
+        """The card for people."""
+        name, *more = self.rows()
+        rows = [
+            name,
+            ("configuration", ", ".join(f"{name} = {value}" for name, value in self.config.items())),
+            *more,
+            ("seed", self.seed),
+            ("written by", f"turbnet {self.version}"),
+            ("SHA-256", f"`{self.sha256}`"),
+            *self.notes.items(),
+        ]
+        table = "\n".join(f"| {name} | {str(value).replace('|', '/')} |" for name, value in rows)
+        return f"# {title}\n\n| | |\n|---|---|\n{table}\n"
+
+    def write_beside(self, model: str | Path) -> None:
+        """Write the card as JSON and as Markdown beside the file of the model."""
+        model = Path(model)
+        for suffix, text in ((".json", self.to_json()), (".md", self.to_markdown(model.stem))):
+            with atomic_path(model.with_suffix(suffix)) as temporary:
+                temporary.write_text(text)
+
+
 @dataclass(frozen=True)
-class ModelCard:
+class ModelCard(Card):
     """What a network is and what it asks of its input, `frames` (batch, frames, channels, height, width).
 
     Args:
@@ -42,52 +107,45 @@ class ModelCard:
     version: str = __version__
     sha256: str = UNSEALED
 
-    def to_metadata(self) -> dict[str, str]:
-        """The card as ONNX `metadata_props`: keys `turbnet.<field>`, values JSON, the digest bare."""
-        values = {name: json.dumps(value, allow_nan=False) for name, value in asdict(self).items()}
-        return {PREFIX + name: value for name, value in (values | {"sha256": self.sha256}).items()}
+    def __post_init__(self) -> None:
+        low, high = self.data_range
+        object.__setattr__(self, "data_range", (low, high))  # JSON knows lists only
 
-    @classmethod
-    def from_metadata(cls, metadata: Mapping[str, str]) -> "ModelCard":
-        """The card in a file's metadata.
-
-        Raises:
-            InputError: a field is missing or is not what this version of turbnet writes.
-        """
-        try:
-            values = {item.name: metadata[PREFIX + item.name] for item in fields(cls)}
-            sha256 = values.pop("sha256")
-            card = {name: json.loads(value) for name, value in values.items()}
-            return cls(**card | {"data_range": tuple(card["data_range"]), "sha256": sha256})
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(
-                f"the model card cannot be read by turbnet {__version__} ({error}); "
-                f"it was written by turbnet {metadata.get(PREFIX + 'version', 'of unknown version')}"
-            ) from error
-
-    def to_json(self) -> str:
-        return json.dumps(asdict(self), indent=2) + "\n"
-
-    def to_markdown(self, title: str) -> str:
-        """The card for people."""
-        rows = [
+    def rows(self) -> list[tuple[str, Any]]:
+        return [
             ("architecture", self.architecture),
-            ("configuration", ", ".join(f"{name} = {value}" for name, value in self.config.items())),
             ("input and output", f"(batch, frames, {self.channels}, height, width), RGB, sRGB-encoded, float32"),
             ("values", "{:g} to {:g}".format(*self.data_range)),
             ("height and width", f"multiples of {self.size_multiple}"),
             ("frames at a time", f"{self.frames} recommended, any number accepted"),
-            ("seed", self.seed),
-            ("written by", f"turbnet {self.version}"),
-            ("SHA-256", f"`{self.sha256}`"),
-            *self.notes.items(),
         ]
-        table = "\n".join(f"| {name} | {str(value).replace('|', '/')} |" for name, value in rows)
-        return f"# {title}\n\n| | |\n|---|---|\n{table}\n"
 
-    def write_beside(self, model: str | Path) -> None:
-        """Write the card as JSON and as Markdown beside the file of the model."""
-        model = Path(model)
-        for suffix, text in ((".json", self.to_json()), (".md", self.to_markdown(model.stem))):
-            with atomic_path(model.with_suffix(suffix)) as temporary:
-                temporary.write_text(text)
+
+@dataclass(frozen=True)
+class RecogniserCard(Card):
+    """What a reader of text is and what it asks of its input, `lines` (batch, 1, line_height, width).
+
+    Args:
+        config: arguments the network was built with, plain values.
+        alphabet: characters of classes 1, 2, ...; class 0 is none.
+        line_height: pixels.
+        stride: the width must be a multiple of it, pixels.
+        seed, notes, version, sha256: as in `ModelCard`.
+    """
+
+    config: dict[str, Any]
+    alphabet: str
+    line_height: int
+    stride: int
+    seed: int | None = None
+    notes: dict[str, Any] = field(default_factory=dict)
+    version: str = __version__
+    sha256: str = UNSEALED
+
+    def rows(self) -> list[tuple[str, Any]]:
+        return [
+            ("architecture", "recogniser"),
+            ("input", f"(batch, 1, {self.line_height}, width), grey, sRGB-encoded, float32, 0 to 1"),
+            ("output", f"(batch, width / {self.stride}, {1 + len(self.alphabet)}), logarithms of probabilities"),
+            ("classes", f"none, then {self.alphabet}"),
+        ]

@@ -20,7 +20,7 @@ import onnx
 import torch
 from torch import nn
 
-from turbnet.deploy.card import ModelCard
+from turbnet.deploy.card import Card, ModelCard
 from turbnet.deploy.seal import seal
 from turbnet.deploy.session import INPUT, OUTPUT, Model
 from turbnet.errors import InputError
@@ -51,11 +51,7 @@ def export_onnx(module: nn.Module, card: ModelCard, path: str | Path) -> list[Pa
     """
     with atomic_path(path) as temporary:
         module = flush_denormals(copy.deepcopy(module).cpu().float().eval())
-        model = _strip(_to_onnx(module, card))
-        for key, value in card.to_metadata().items():
-            model.metadata_props.add(key=key, value=value)
-        _check_no_local_path(model)
-        data = seal(model.SerializeToString())
+        data = sealed(_name_sizes(_to_onnx(module, card)), card)
         try:
             parity = compare(module, Model(data))
         except InputError as error:
@@ -68,6 +64,19 @@ def export_onnx(module: nn.Module, card: ModelCard, path: str | Path) -> list[Pa
                 )
         temporary.write_bytes(data)
     return parity
+
+
+def sealed(model: onnx.ModelProto, card: Card) -> bytes:
+    """The file of a model: what the exporter says of the source taken out, the card put in, sealed.
+
+    Raises:
+        InputError: a path of this machine would stand in it.
+    """
+    model = _strip(model)
+    for key, value in card.to_metadata().items():
+        model.metadata_props.add(key=key, value=value)
+    _check_no_local_path(model)
+    return seal(model.SerializeToString())
 
 
 def compare(module: nn.Module, model: Model) -> list[Parity]:
@@ -106,7 +115,7 @@ def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
     shape = (2, max(card.frames, 3), card.channels, 6 * card.size_multiple, 8 * card.size_multiple)
     free = {axis: torch.export.Dim.DYNAMIC for axis in (0, 1, 3, 4)}
     try:
-        with _quiet():
+        with quiet_exporter():
             program = torch.onnx.export(
                 module,
                 (torch.rand(shape, generator=torch.Generator().manual_seed(0)),),
@@ -125,7 +134,7 @@ def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet_exporter() -> Iterator[None]:
     """Silence the exporter's remarks on optional packages and on its own deprecated calls."""
     log = logging.getLogger("torch.onnx")
     level = log.level
@@ -139,14 +148,19 @@ def _quiet() -> Iterator[None]:
 
 
 def _strip(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Remove what the exporter says of the source, and name the free sizes."""
+    """Remove what the exporter says of the source."""
     graph = model.graph
     del model.metadata_props[:], graph.metadata_props[:], graph.value_info[:]
     model.doc_string = graph.doc_string = ""
     for item in (*graph.node, *graph.input, *graph.output, *graph.initializer):
         item.doc_string = ""
         del item.metadata_props[:]
-    for value in (*graph.input, *graph.output):
+    return model
+
+
+def _name_sizes(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Name the free sizes."""
+    for value in (*model.graph.input, *model.graph.output):
         for axis, name in ((0, "batch"), (1, "frames"), (3, "height"), (4, "width")):
             value.type.tensor_type.shape.dim[axis].dim_param = name
     return model

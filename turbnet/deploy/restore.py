@@ -1,4 +1,4 @@
-"""Clips through a released network: file in, file out."""
+"""Clips through a released network or a classical method: file in, file out."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from turbnet.deploy.method import ClassicalMethod
 from turbnet.deploy.session import Model
 from turbnet.deploy.stream import stream, window_count
 from turbnet.deploy.tiling import Tiling
@@ -26,7 +27,7 @@ class Restoration:
         window: frames restored together.
         tiles: tiles of a frame.
         seconds: wall-clock time from the first frame read to the last one written.
-        network_seconds: the part of it spent inside the network.
+        network_seconds: the part of it spent inside the network or the method.
     """
 
     frames: int
@@ -85,7 +86,7 @@ def window_overlap(window: int) -> int:
 def restore_clip(
     source: str | Path,
     destination: str | Path,
-    model: Model,
+    model: Model | ClassicalMethod,
     *,
     crop: tuple[int, int, int, int] | None = None,
     tile: int = TILE,
@@ -99,7 +100,7 @@ def restore_clip(
         crop: (left, top, width, height), pixels; None: the whole frame.
         tile: greatest side of a tile, pixels.
         overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
-        window: frames restored together; None: what the model's card recommends.
+        window: frames restored together; None: what the model's card recommends, 50 for a classical method.
         quiet: no progress bar on standard error.
 
     Raises:
@@ -121,9 +122,12 @@ def restore_clip(
         def network(frames_BTCHW: np.ndarray) -> np.ndarray:
             nonlocal inside
             began = time.perf_counter()
-            restored_BTCHW = model(frames_BTCHW)
+            if isinstance(model, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
+                restored_BTCHW = model(frames_BTCHW, lambda share: progress.advance(task, share))
+            else:
+                restored_BTCHW = model(frames_BTCHW)
+                progress.advance(task)
             inside += time.perf_counter() - began
-            progress.advance(task)
             return restored_BTCHW
 
         for frame_HWC in restore_frames(clip, network, tiling, window):

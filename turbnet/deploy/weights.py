@@ -5,11 +5,22 @@ from pathlib import Path
 
 from turbnet.errors import InputError
 
+RECOGNISER = "recogniser"
+"""Name of the released network that reads text; it restores nothing."""
+
 
 def released_models() -> dict[str, Path]:
-    """File of each released network, by name."""
-    folder = Path(str(resources.files("turbnet.weights")))
-    return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
+    """File of each released network that restores, by name."""
+    return {path.stem: path for path in sorted(_folder().glob("*.onnx")) if path.stem != RECOGNISER}
+
+
+def released_recogniser() -> Path:
+    """File of the network that reads text."""
+    return _folder() / f"{RECOGNISER}.onnx"
+
+
+def _folder() -> Path:
+    return Path(str(resources.files("turbnet.weights")))
 
 
 def find_model(name_or_path: str | Path) -> Path:

@@ -1,12 +1,17 @@
-"""PSNR and SSIM of frames against their reference, by torchmetrics, on values with black at 0 and white at 1.
+"""PSNR, SSIM and MS-SSIM of frames against their reference, by torchmetrics, on values with black at 0, white at 1.
 
     PSNR = 10 log10(1 / MSE) dB, MSE over the pixels and channels of a frame; infinite for equal frames.
     SSIM = mean of (2 mu_x mu_y + C1)(2 s_xy + C2) / ((mu_x^2 + mu_y^2 + C1)(s_x^2 + s_y^2 + C2)),
            Gaussian window of sigma 1.5 (11 x 11), C1 = 0.01^2, C2 = 0.03^2, over the channels and the pixels whose
            window lies inside the frame (Wang et al., IEEE Trans. Image Process. 13, 600, 2004).
 
-Both agree with scikit-image's (`gaussian_weights=True, sigma=1.5, use_sample_covariance=False`). The figure of a clip
-is the mean over its frames.
+    MS-SSIM = product over five scales, each half the one before, of the contrast and structure terms and, at the
+           coarsest, of the luminance term, raised to 0.0448, 0.2856, 0.3001, 0.2363, 0.1333 (Wang et al., Asilomar
+           (2003)); negative terms count as 0. Edges as torchmetrics has them: reflected.
+
+PSNR and SSIM agree with scikit-image's (`gaussian_weights=True, sigma=1.5, use_sample_covariance=False`), MS-SSIM with
+torchmetrics'. The figure of a clip is the mean over its frames. Nothing is registered here: a restoration that is
+shifted scores as what it is, and `turbnet.metrics.registration` tells how far the whole is shifted.
 """
 
 from typing import Any, overload
@@ -15,7 +20,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torchmetrics.functional.image import (
+    multiscale_structural_similarity_index_measure,
+    peak_signal_noise_ratio,
+    structural_similarity_index_measure,
+)
 
 from turbnet.errors import InputError, check_range
 
@@ -24,6 +33,8 @@ Frames = NDArray[np.floating[Any]]
 _SIGMA = 1.5
 _REACH = 5  # pixels from the window's centre to its edge: 3.5 sigma
 _WINDOW = 2 * _REACH + 1
+MS_SSIM_SIZE = 2**4 * _WINDOW
+"""Least height and width for MS-SSIM, pixels: the window must fit into the coarsest of five scales."""
 
 
 @overload
@@ -62,6 +73,20 @@ def ssim(restored: Any, reference: Any, border: int = 0) -> Any:
     """
     first_NCHW, second_NCHW, finish = _prepare(restored, reference, border, smallest=_WINDOW)
     return finish(torch.stack([_ssim(*pair) for pair in zip(first_NCHW, second_NCHW, strict=True)]))
+
+
+@overload
+def ms_ssim(restored: Tensor, reference: Tensor, border: int = 0) -> Tensor: ...
+@overload
+def ms_ssim(restored: Frames, reference: Frames, border: int = 0) -> Frames: ...
+def ms_ssim(restored: Any, reference: Any, border: int = 0) -> Any:
+    """Multi-scale structural similarity of each frame, 0 to 1. Arguments and errors as `psnr`; frames need 176 x 176."""
+    first_NCHW, second_NCHW, finish = _prepare(restored, reference, border, smallest=MS_SSIM_SIZE)
+    return finish(
+        multiscale_structural_similarity_index_measure(
+            first_NCHW, second_NCHW, sigma=_SIGMA, data_range=1.0, reduction="none", normalize="relu"
+        )
+    )
 
 
 def _ssim(first_CHW: Tensor, second_CHW: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ with the PSF basis phi of `turbnet.simulate.psf_basis` (beta_0 = 1). The weights
 grid and are interpolated to pixels: scattering, indexed by the source.
 
 The components may be summed at half the resolution: what differs from point to point is mostly what turbulence leaves of
-the low frequencies. Then J is low-passed and twice every second pixel taken (P: P P^T = 1), and what the components make
-of it is put back below half the Nyquist frequency:
+the low frequencies. Then J is low-passed and twice every second pixel taken (P), and what the components make of it is put
+back below half the Nyquist frequency; P P^T = 1 but for the soft edge of both:
 
 .. math:: B(J) \approx \phi_0 * J + P^T \sum_m \phi_m * (\beta_m \cdot P J)
 """
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from turbnet.simulate.phase_to_space import PhaseToSpace
-from turbnet.simulate.psf_basis import PSFBasis, low_band
+from turbnet.simulate.psf_basis import PSFBasis, low_band, roll_off
 from turbnet.simulate.tilt import upsample
 
 _TILE = 768
@@ -164,7 +164,8 @@ class _Scatter(torch.autograd.Function):
         if back is not None:
             spectrum = spectrum * mean.conj()
             if len(components_M):
-                _put_back(spectrum, torch.fft.rfft2(back), ctx.factor)
+                passed = torch.fft.rfft2(back) * roll_off(tuple(ctx.size), ctx.factor).to(back)
+                _put_back(spectrum, passed, ctx.factor)
             image = torch.fft.irfft2(spectrum, s=ctx.size)
         return image, weights, None, None, None
 
@@ -174,7 +175,8 @@ def _low_pass(spectrum: Tensor, image: Tensor, factor: int) -> Tensor:
     if factor == 1:
         return image
     small = [n // factor for n in image.shape[-2:]]
-    return torch.fft.irfft2(low_band(spectrum, factor), s=small) / factor
+    passed = low_band(spectrum, factor) * roll_off(tuple(image.shape[-2:]), factor).to(image)
+    return torch.fft.irfft2(passed, s=small) / factor
 
 
 def _sum_components(low_BChw: Tensor, beta_BMhw: Tensor, components_M: Tensor) -> Tensor:

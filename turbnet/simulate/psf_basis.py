@@ -34,6 +34,7 @@ MOST = 120
 """Components that a basis holds."""
 
 _CHUNK = 1024  # PSFs at a time: what one step leaves is still in the processor's cache at the next
+_PASS = 0.42  # cycles a pixel of the smaller picture up to which all passes
 _LOWEST = 1 / 64  # cycles a pixel; lower frequencies count as this one
 
 
@@ -200,7 +201,7 @@ class PSFBasis:
             kernels = torch.cat((self.mean[None], self.components)).to(dtype)
             kernels = F.pad(kernels, (0, size[1] - self.size, 0, size[0] - self.size))
             whole = torch.fft.rfft2(kernels.roll((-half, -half), (1, 2)))
-            self._transfers[key] = [whole[0], low_band(whole[1:], factor).contiguous()]
+            self._transfers[key] = [whole[0], low_band(whole[1:], factor) * roll_off(tuple(size), factor).to(dtype)]
         return self._transfers[key]  # type: ignore[return-value]
 
     @cached_property
@@ -218,6 +219,22 @@ def low_band(spectrum: Tensor, factor: int) -> Tensor:
     low[..., :h, :w] = spectrum[..., :h, :w]
     low[..., h + 1 :, :w] = spectrum[..., -(h - 1) :, :w]
     return low
+
+
+@lru_cache
+def roll_off(size: Sequence[int], factor: int) -> Tensor:
+    """What passes from an FFT of `size` to one of 1/factor of it: 1, falling like a squared cosine in the outer sixth.
+
+    A sharp cut would ring across the picture. (rows, columns // 2 + 1) of the smaller one.
+    """
+    rows, columns = (n // factor for n in size)
+    if factor == 1:
+        return torch.ones(rows, columns // 2 + 1)
+    sides = []
+    for f in (np.fft.fftfreq(rows), np.fft.rfftfreq(columns)):
+        outer = np.clip((np.abs(f) - _PASS) / (0.5 - _PASS), 0, 1)
+        sides.append(torch.from_numpy(np.cos(np.pi / 2 * outer) ** 2).float())
+    return torch.outer(*sides)
 
 
 @lru_cache

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_LEVELS = 4
+_LEVELS = 6
 _HALF = 4  # cells -4..4: nine across
 _INNER = 1  # bins -1..1 are handed down to the next level
 _NEAR = 8  # bins beyond this carry what their midpoint says

@@ -1,0 +1,89 @@
+r"""The default pipeline: reference, registration, fusion, blind deconvolution; nothing to set for a clip.
+
+1. **Reference.** Each frame gets its non-local mean: what is still is averaged, what moves stays.
+2. **Registration.** Each frame is brought to its own reference by optical flow at half resolution. Both steps are done
+   twice, the second time with references made of registered frames, which are sharper.
+3. **Fusion.** For each frame the registered ones are averaged where they show the same, sharper ones counting a little
+   more: (S + mean S)^4, S the local variance, which goes like S^2 near the mean but never outvotes a flat object that
+   passes before a lively scene.
+4. **Deconvolution.** The dance tells D/r0, that the mean PSF; one blind round on the middle frame refines the kernel, and
+   every frame is deconvolved with it by total variation. The noise is what registered frames still differ by, over the
+   root of how many are averaged.
+
+A moving object gains from no other frame: it keeps its own noise and its own blur, which is deconvolved with the rest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from turbnet.classical.blind import STRONGEST, WEAKEST, blind_kernel, strength_of_dance
+from turbnet.classical.deconvolution import total_variation
+from turbnet.classical.fusion import soft_weights
+from turbnet.classical.local import Array, check_clip, luminance
+from turbnet.classical.reference import non_local_means, still_variance
+from turbnet.classical.registration import register
+from turbnet.classical.sharpness import variance
+from turbnet.errors import InputError
+from turbnet.simulate.parallel import on_all_cores
+
+PASSES = 2
+REDUCTION = 2
+ROUNDS = 1
+"""Of the blind search. The dance knows the kernel's width better than alternating minimisation does, which drifts."""
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What the pipeline made: `frames` (T, H, W, C), the strength D/r0 that it saw, the `kernel` (k, k) it took out.
+
+    Below D/r0 = 0.5 the air does not blur: nothing is deconvolved and the kernel is a point.
+    """
+
+    frames: Array
+    d_over_r0: float
+    kernel: Array
+
+
+def restore(frames_THWC: Array, cores: int = 1, report: Callable[[float], object] = lambda share: None) -> Restored:
+    """Restore a clip.
+
+    Args:
+        frames_THWC: linear intensities, T >= 2; 12 or more for turbulence to average out.
+        cores: frames at a time.
+        report: is told after each step which share of the work it was; the shares sum to one.
+
+    Raises:
+        InputError: fewer than two frames, or values that are not finite.
+    """
+    clip = check_clip(frames_THWC)
+    if len(clip) < 2:
+        raise InputError("turbulence is taken out by comparing frames; this clip has a single one")
+    aligned = clip
+    for _ in range(PASSES):
+        references = np.stack(list(non_local_means(aligned, cores=cores)))
+        report(0.1)
+        aligned, shifts = register(clip, references, reduction=REDUCTION, cores=cores)
+        report(0.2)
+
+    y = luminance(aligned)
+    sharpness = variance(y)
+    weights = soft_weights(sharpness + sharpness.mean(axis=0), power=4.0)
+    fused = np.stack(list(non_local_means(aligned, weights, cores=cores)))
+    report(0.1)
+
+    strength = strength_of_dance(shifts)
+    if strength < WEAKEST:
+        report(0.3)
+        return Restored(fused, strength, np.ones((1, 1), np.float32))
+    noise = float(np.sqrt(still_variance(y).mean() / len(y)))
+    middle_HW = luminance(fused[len(fused) // 2])
+    kernel = blind_kernel(middle_HW, noise, min(strength, STRONGEST), rounds=ROUNDS)
+
+    def sharpen(frame_HWC: Array) -> Array:
+        return total_variation(frame_HWC, kernel, noise)
+
+    sharp = np.stack(list(on_all_cores(sharpen, fused, cores)))
+    report(0.3)
+    return Restored(sharp, strength, kernel)
