@@ -1,10 +1,16 @@
+from dataclasses import replace
+
 import pytest
+import skimage.data
 import torch
 from scipy.special import j1
 
+import turbnet.simulate.blur as blur_module
+from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import ParameterError
 from turbnet.simulate.blur import blur, blur_weights
-from turbnet.simulate.psf_basis import kernel_size, psf_basis, tilt_free_psf
+from turbnet.simulate.field import ZernikeField
+from turbnet.simulate.psf_basis import PSFBasis, kernel_size, psf_basis, tilt_free_psf
 
 KERNEL = kernel_size()
 
@@ -124,3 +130,104 @@ def test_gradients_in_picture_and_coefficients():
 def test_too_many_components_are_refused():
     with pytest.raises(ParameterError, match="components"):
         psf_basis(1000, 1.0, 1.0)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def double(basis: PSFBasis) -> PSFBasis:
+    parts = {name: getattr(basis, name).double() for name in ("mean", "components", "dual", "variance")}
+    return replace(basis, **parts)
+
+
+def field_weights(size: int, strength: float, components: int) -> tuple[torch.Tensor, PSFBasis]:
+    draw = ZernikeField(OpticalPath.from_d_over_r0(strength), size, size, modes=36).draw([0])
+    basis = psf_basis(components, strength, strength)
+    return blur_weights(draw.high[0], basis), basis
+
+
+def smooth_scene(size: int, highest: float) -> torch.Tensor:
+    """Noise of frequencies below `highest` cycles a pixel, in a window with no edges, (1, 1, size, size)."""
+    noise = torch.randn(size, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    f = torch.fft.fftfreq(size).abs()
+    low = torch.fft.ifft2(torch.fft.fft2(noise) * (f < highest) * (f < highest)[:, None]).real
+    window = torch.zeros(size, dtype=torch.float64)
+    window[size // 5 : -(size // 5)] = torch.hann_window(size - 2 * (size // 5), dtype=torch.float64)
+    window = window.square()  # tails of its spectrum fall as f^-5
+    return (low * window * window[:, None])[None, None]
+
+
+@pytest.mark.parametrize("size", [160, 161])
+@pytest.mark.parametrize(("depth", "error"), [(0.0, 1e-5), (0.5, 5e-3)])
+def test_half_the_resolution_is_exact_below_its_soft_edge(size, depth, error):
+    """To 0.21 cycles a pixel, with the same weights everywhere; others bring what bicubic interpolation has beyond."""
+    basis, scene = psf_basis(12, 3.0, 3.0), smooth_scene(size, 0.12)
+    wave = torch.cos(2 * torch.pi / 80 * torch.arange(1 + -(-size // 4)) * 4.0)
+    some = torch.randn(1, 12, 1, 1, generator=generator(1)) * basis.variance.sqrt()[:, None, None]
+    weights = (some * (1 + depth * wave * wave[:, None])).double()
+    full, half = (blur(scene, weights, basis, 4, factor) for factor in (1, 2))
+    components = full - blur(scene, weights[:, :0], basis.leading(0), 4)
+    assert float((half - full).norm() / components.norm()) < error
+
+
+def test_half_the_resolution_is_wrong_only_by_what_it_cannot_hold():
+    """White noise has three quarters of its energy beyond; most of the components' energy lies below."""
+    weights, basis = field_weights(96, 3.0, 20)
+    scene = torch.rand(1, 1, 96, 96, generator=torch.Generator().manual_seed(2))
+    full, half = (blur(scene, weights, basis, 4, factor) for factor in (1, 2))
+    components = full - blur(scene, weights[:, :0], basis.leading(0), 4)
+    assert 0.01 < float((half - full).norm() / components.norm()) < 0.5
+
+
+@pytest.mark.parametrize("size", [(150, 150), (97, 170), (131, 40)])
+@pytest.mark.parametrize("stride", [4, 3])
+def test_tiles_are_the_whole(monkeypatch, size, stride):
+    basis = psf_basis(8, 2.0, 2.0)
+    noise = generator(3)
+    h, w = (1 + -(-n // stride) for n in size)
+    weights = torch.randn(2, 8, h, w, generator=noise) * basis.variance.sqrt()[:, None, None]
+    scene = torch.rand(2, 3, *size, generator=noise)
+    whole = blur(scene, weights, basis, stride)
+    monkeypatch.setattr(blur_module, "_TILE", 64)
+    monkeypatch.setattr(blur_module, "_PIECE", 50)
+    torch.testing.assert_close(blur(scene, weights, basis, stride), whole, rtol=0, atol=5e-6)
+
+
+def test_tiles_at_half_the_resolution_differ_by_far_less_than_half_the_resolution_does(monkeypatch):
+    """A piece ends sharply half a kernel away, from which its low pass rings a little."""
+    weights, basis = field_weights(160, 3.0, 20)
+    scene = torch.from_numpy(skimage.data.camera()[100:260, 200:360].copy()).float()[None, None] / 255
+    full, half = (blur(scene, weights, basis, 4, factor) for factor in (1, 2))
+    monkeypatch.setattr(blur_module, "_TILE", 64)
+    monkeypatch.setattr(blur_module, "_PIECE", 48)
+    tiles = blur(scene, weights, basis, 4, 2)
+    assert float((tiles - half).square().mean()) < 0.1 * float((half - full).square().mean())
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+@pytest.mark.parametrize("tile", [768, 24])
+def test_the_adjoint_is_the_gradient(monkeypatch, factor, tile):
+    """<B x, y> = <x, B^T y>, and B is linear in the weights beyond the mean's part as well."""
+    monkeypatch.setattr(blur_module, "_TILE", tile)
+    monkeypatch.setattr(blur_module, "_PIECE", 20)
+    basis = double(psf_basis(5, 2.0, 2.0))
+    x, other, y = (torch.randn(2, 3, 37, 30, generator=generator(n), dtype=torch.float64) for n in range(3))
+    x.requires_grad_()
+    weights = torch.randn(2, 5, 11, 9, generator=generator(3), dtype=torch.float64).requires_grad_()
+    seen = blur(x, weights, basis, 4, factor)
+    back, turn = torch.autograd.grad((seen * y).sum(), (x, weights))
+    for scene in (x.detach(), other):
+        product = (blur(scene, weights.detach(), basis, 4, factor) * y).sum()
+        assert float((scene * back).sum()) == pytest.approx(float(product), rel=1e-9)
+    mean = (blur(x.detach(), torch.zeros_like(weights), basis, 4, factor) * y).sum()
+    weighted = float((seen.detach() * y).sum() - mean)
+    assert float((weights.detach() * turn).sum()) == pytest.approx(weighted, rel=1e-9)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_gradients_at_both_resolutions(factor):
+    basis = double(psf_basis(3, 2.0, 2.0))
+    scene = torch.rand(2, 1, 9, 7, generator=generator(0), dtype=torch.float64, requires_grad=True)
+    weights = torch.randn(2, 3, 4, 3, generator=generator(1), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, w: blur(s, w, basis, 4, factor), (scene, weights), fast_mode=True)

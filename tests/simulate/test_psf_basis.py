@@ -11,6 +11,7 @@ from turbnet.optics.pupil import circular, pupil_grid
 from turbnet.optics.zernike import zernike_basis
 from turbnet.simulate.psf_basis import (
     PUPIL,
+    _whole_basis,
     in_metric,
     kernel_size,
     psf_basis,
@@ -151,3 +152,18 @@ def test_a_wide_range_of_strengths_is_log_uniform():
     exact = noll_covariance(4, 4) * (4 ** (5 / 3) - 1) / (5 / 3 * np.log(4))
     energies = samples[:, 0].double().square()
     assert abs(float(energies.mean()) - exact) < 4 * float(energies.std()) / np.sqrt(3000)
+
+
+def test_a_basis_made_on_two_threads_is_the_same_to_rounding():
+    """Matrix products and sums are taken in another order."""
+    basis = psf_basis(8, 2.5, 2.5)
+    psf = tilt_free_psf(fresh_high(20, seed=3))
+    try:
+        torch.set_num_threads(2)
+        _whole_basis.cache_clear()
+        other = psf_basis(8, 2.5, 2.5)
+    finally:
+        torch.set_num_threads(1)
+        _whole_basis.cache_clear()
+    rounding = 1e-3 * float(psf.std())
+    torch.testing.assert_close(other.psf(other.weights(psf)), basis.psf(basis.weights(psf)), rtol=0, atol=rounding)

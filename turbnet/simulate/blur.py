@@ -7,10 +7,10 @@ with the PSF basis phi of `turbnet.simulate.psf_basis` (beta_0 = 1). The weights
 grid and are interpolated to pixels: scattering, indexed by the source.
 
 The components may be summed at half the resolution: what differs from point to point is mostly what turbulence leaves of
-the low frequencies. Then J is low-passed and every second pixel taken (P), and what the components make of it is put back
-below half the Nyquist frequency (U = 4 P^T), both with a soft edge:
+the low frequencies. Then J is low-passed and twice every second pixel taken (P), and what the components make of it is put
+back below half the Nyquist frequency; P P^T = 1 but for the soft edge of both:
 
-.. math:: B(J) \approx \phi_0 * J + U \sum_m \phi_m * (\beta_m \cdot P J)
+.. math:: B(J) \approx \phi_0 * J + P^T \sum_m \phi_m * (\beta_m \cdot P J)
 """
 
 from typing import Any
@@ -128,7 +128,7 @@ def _fine_weights(weights_BMhw: Tensor, stride: int, factor: int, offset: list[i
 
 
 class _Scatter(torch.autograd.Function):
-    """phi_0 * J + U sum_m phi_m * (beta_m P J), circular; its adjoint costs what it costs itself."""
+    """phi_0 * J + P^T sum_m phi_m * (beta_m P J), circular; its adjoint costs what it costs itself."""
 
     @staticmethod
     def forward(
@@ -150,12 +150,11 @@ class _Scatter(torch.autograd.Function):
         low_BChw, beta_BMhw, mean, components_M = ctx.saved_tensors
         wants_image, wants_beta = ctx.needs_input_grad[:2]
         spectrum = torch.fft.rfft2(gradient_BCHW)
-        band = low_band(spectrum, ctx.factor)
+        band = low_band(spectrum, ctx.factor) / ctx.factor
         small = low_BChw.shape[-2:]
         back = torch.zeros_like(low_BChw) if wants_image else None
         weights = torch.empty_like(beta_BMhw) if wants_beta else None
         for m, transfer in enumerate(components_M):
-            # Of P g up to its norm: the norm of U P g = 4 P^T P g goes to the weights.
             gathered = torch.fft.irfft2(band * transfer.conj(), s=small)
             if back is not None:
                 back.addcmul_(gathered, beta_BMhw[:, m, None])
@@ -172,12 +171,12 @@ class _Scatter(torch.autograd.Function):
 
 
 def _low_pass(spectrum: Tensor, image: Tensor, factor: int) -> Tensor:
-    """Every factor-th pixel of the image below the Nyquist frequency of those."""
+    """P: every factor-th pixel of the image below the Nyquist frequency of those, times the factor."""
     if factor == 1:
         return image
     small = [n // factor for n in image.shape[-2:]]
     passed = low_band(spectrum, factor) * roll_off(tuple(image.shape[-2:]), factor).to(image)
-    return torch.fft.irfft2(passed, s=small) / factor**2
+    return torch.fft.irfft2(passed, s=small) / factor
 
 
 def _sum_components(low_BChw: Tensor, beta_BMhw: Tensor, components_M: Tensor) -> Tensor:
@@ -188,12 +187,12 @@ def _sum_components(low_BChw: Tensor, beta_BMhw: Tensor, components_M: Tensor) -
 
 
 def _put_back(spectrum: Tensor, low: Tensor, factor: int) -> None:
-    """Add to a spectrum the one of every factor-th pixel, below the Nyquist frequency of those."""
+    """P^T: add to a spectrum that of every factor-th pixel, below the Nyquist frequency of those."""
     if factor == 1:
         spectrum += low
         return
     h, w = low.shape[-2] // 2, low.shape[-1] - 1
-    low = low * factor**2
+    low = low * factor
     spectrum[..., :h, :w] += low[..., :h, :w]
     spectrum[..., -(h - 1) :, :w] += low[..., h + 1 :, :w]
 

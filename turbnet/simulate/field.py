@@ -99,7 +99,8 @@ class ZernikeField(nn.Module):
         self.path, self.stride, self.margin, self.q, self.boiling = path, stride, margin, q, boiling
         self.dtype = dtype
         self.pixel = path.pixel * q
-        self.rows, self.columns = (1 + -(-(n + 2 * margin - 1) // stride) for n in (height, width))
+        # One step past the last pixel: the same grid holds the picture at any scale.
+        self.rows, self.columns = (1 + -(-(n + 2 * margin) // stride) for n in (height, width))
         self.noll = range(2, modes + 1)
         self.orders = [noll_to_nm(j)[0] for j in self.noll]
         # Cells of frequencies stay within 1 : 2.

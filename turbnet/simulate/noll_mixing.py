@@ -75,7 +75,7 @@ class NollMixing(nn.Module):
         if path.d_over_r0 == 0:
             raise ParameterError("a path of still air has no correlation to draw from; give it a Cn2 above 0")
         self.path, self.stride, self.margin = path, stride, margin
-        self.rows, self.columns = (1 + -(-(n + 2 * margin - 1) // stride) for n in (height, width))
+        self.rows, self.columns = (1 + -(-(n + 2 * margin) // stride) for n in (height, width))
         self.noll = range(2, modes + 1)
         size = next_fast_len(max(int(np.ceil(padding * max(self.rows, self.columns))), 16), real=True)
 

@@ -51,6 +51,7 @@ _RESERVE = 2.0  # dB kept in hand: a frame's own atmosphere is not the average o
 _SAMPLES = 300
 _FINE_PUPIL = 24
 _PATCH = 96  # pixels a side of the field on which the weights' grid is judged
+_FULL = 60  # components that a simulation without savings takes
 _COMPONENTS = (1, 2, 3, 5, 8, 10, 12, 16, 20, 25, 30, 40, 50, 60, 80, 100, MOST)
 
 
@@ -198,7 +199,7 @@ class Planner:
             errors.append(("no tilt", shift))
         still = self._mse(self.exact - _point(self.exact))
         if components is None and not exact and still < 0.3 * budget:
-            plan = Plan(tolerance, 3, False, 0, tilt=tilt, network=False, errors=(*errors, ("no blur", still)))
+            plan = Plan(tolerance, modes or 3, False, 0, tilt=tilt, network=False, errors=(*errors, ("no blur", still)))
             return self._with_work(plan)
 
         points, pupil = self._pupil(0.3 * budget)
@@ -315,7 +316,14 @@ class Planner:
 
     def _with_work(self, plan: Plan) -> Plan:
         everything = replace(
-            plan, modes=MODES, blur=True, components=60, points=PUPIL, network=False, grid=1, factor=1, tilt=True
+            plan,
+            modes=max(MODES, plan.modes),
+            blur=True,
+            components=max(_FULL, plan.components),
+            network=False,
+            grid=1,
+            factor=1,
+            tilt=True,
         )
         own, full = self._work(plan), self._work(everything)
         return replace(plan, work=tuple((name, own[name], full[name]) for name in full))

@@ -141,9 +141,8 @@ class Simulator(nn.Module):
         self._planned = self._plan(tolerance, contrast)
         if not self._rigid:
             self.margin = self._reach(kernel_size(q, self._planned.points))
-        # Weights on every second point begin with the picture's padded corner too.
-        step = stride * self._planned.grid
-        self.margin = -(-self.margin // step) * step
+        self.margin = -(-self.margin // stride) * stride
+        self._contrast, self._air = contrast, (layers, outer_scale, boiling)
         self.field = ZernikeField(
             path, height, width, self.margin, self._planned.modes, stride, layers, q, outer_scale, boiling, dtype
         )
@@ -213,21 +212,28 @@ class Simulator(nn.Module):
                 f"scale = {scale:g} makes {self.height} x {self.width} pixels, grid {self.stride} and margin "
                 f"{self.margin} something else than whole pixels"
             )
+        _, components, exact = self._given
+        layers, outer_scale, boiling = self._air
         return Simulator(
             self.path,
             int(height),
             int(width),
             self._planned.modes,
             int(stride),
-            None,
+            components,
             self.strengths,
             self.sensor,
             int(margin),
             self.uniform,
             self._planned.tolerance,
-            q=self.q / scale,
-            wavelengths=self.wavelengths,
-            dtype=self.field.dtype,
+            self._contrast,
+            self.q / scale,
+            self.wavelengths,
+            exact,
+            outer_scale,
+            boiling,
+            layers,
+            self.field.dtype,
         )
 
     def forward(self, scene_BTCHW: Tensor, draw: Draw, noise_seed: int = 0) -> Turbulent:
@@ -304,6 +310,11 @@ class Simulator(nn.Module):
         if scene_BTCHW.ndim != 5 or scene_BTCHW.shape[-2:] != (self.height, self.width):
             raise InputError(
                 f"the scene is {tuple(scene_BTCHW.shape)}; the simulator expects (B, T, C, {self.height}, {self.width})"
+            )
+        clips, frames = draw.coefficients.shape[0], draw.coefficients.shape[1] // self.sensor.exposures
+        if scene_BTCHW.shape[0] not in (1, clips) or scene_BTCHW.shape[1] not in (1, frames):
+            raise InputError(
+                f"the scene has {scene_BTCHW.shape[0]} clips of {scene_BTCHW.shape[1]} frames, the draw {clips} of {frames}"
             )
         if self.wavelengths is not None and scene_BTCHW.shape[2] != len(self.wavelengths):
             raise InputError(f"the scene has {scene_BTCHW.shape[2]} channels for {len(self.wavelengths)} wavelengths")
