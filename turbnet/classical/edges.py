@@ -6,7 +6,8 @@ A step of contrast c blurred by a Gaussian of the standard deviation s rises by 
 
 so that contrast over steepness, at the steepest points of strong edges, tells s; the sharpest tenth of them are those that
 were sharp in the scene. Fine lines and corners rise less for their contrast nearby and count as wider edges. Pictures
-that were never blurred have s = 0.75 to 0.95 pixels in this measure (those inside scikit-image).
+that were never blurred have s = 0.75 to 1.06 pixels in this measure (those inside scikit-image): differences over two pixels
+alone make 0.7.
 """
 
 import numpy as np

@@ -1,0 +1,42 @@
+import numpy as np
+import pytest
+import skimage.data
+from scipy.ndimage import gaussian_filter
+
+from turbnet.classical.edges import edge_width
+from turbnet.classical.pipeline import SHARP, _widened
+from turbnet.media.colour import to_linear
+from turbnet.simulate.psf_basis import psf_basis
+
+
+@pytest.mark.parametrize("sigma", [1.5, 2.5, 4.0])
+def test_width_of_blurred_steps(sigma):
+    """A chequerboard with fields far wider than the blur; differences over two pixels add 0.7 pixels of their own."""
+    y, x = np.mgrid[:192, :192]
+    board = 0.2 + 0.6 * ((x // 32 + y // 32) % 2)
+    assert edge_width(gaussian_filter(board, sigma)) == pytest.approx(np.hypot(sigma, 0.7), rel=0.06)
+
+
+@pytest.mark.parametrize("name", ["astronaut", "coffee", "cat", "camera"])
+def test_pictures_never_blurred(name):
+    picture = getattr(skimage.data, name)()
+    grey = to_linear((picture / 255).astype(np.float32))
+    grey = grey @ np.float32([0.2126, 0.7152, 0.0722]) if grey.ndim == 3 else grey
+    widths = [edge_width(gaussian_filter(grey, sigma) if sigma else grey) for sigma in (0, 1, 2, 3)]
+    assert widths[0] == pytest.approx(SHARP, abs=0.3)
+    assert widths[2] == pytest.approx(2.0, abs=0.5)  # lower where nothing is wide enough to show its whole contrast
+    assert widths == sorted(widths)
+
+
+def test_a_flat_picture_tells_nothing():
+    assert edge_width(np.full((64, 64), 0.5, np.float32)) == 0.0
+    assert edge_width(np.zeros((12, 15), np.float32)) == 0.0
+
+
+def test_the_kernel_takes_in_what_edges_show_beyond_it():
+    kernel = psf_basis(0, 2.0, 2.0).mean.numpy()
+    own = np.sqrt(1 / (4 * np.pi * (kernel**2).sum()))
+    assert _widened(kernel, np.hypot(own, SHARP)) is kernel  # explained
+    wide = _widened(kernel, np.hypot(2.5, SHARP))
+    assert wide.sum() == pytest.approx(1, abs=1e-5)
+    assert np.sqrt(1 / (4 * np.pi * (wide**2).sum())) == pytest.approx(2.5, rel=0.15)
