@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from turbnet.classical.local import Array
 
-_AROUND = 15  # pixels a side within which an edge's contrast is taken: wider than the edge
+_AROUND = 15  # pixels a side within which an edge's contrast is taken: widths up to 3 are told right
 _APART = 5  # pixels a side within which only the steepest point counts
 _STRONG = 0.25  # least contrast, over that which a twentieth of the picture exceeds
 _SHARPEST = 10  # per cent of the edges
