@@ -1,9 +1,9 @@
 """Retrain the released weights: one command, resumable.
 
-    python tools/train_released.py --pictures FOLDER [--output outputs/released] [--threads 2]
+    python tools/train_released.py s --pictures FOLDER [--output outputs/released] [--threads 2]
 
-Trains `experiment=small` on the pictures of a folder and rendered text, goes on from the last checkpoint if there is one,
-measures the result on pictures it has never seen, and writes turbnet/weights/small.onnx with its card.
+Trains `experiment=s` (or xs, m) on the pictures of a folder and rendered text, goes on from the last checkpoint if any,
+measures the result on pictures it has never seen, and writes turbnet/weights/s.onnx with its card.
 """
 
 import argparse
@@ -29,6 +29,7 @@ CLIPS, FRAMES, SIZE, WINDOW = 8, 12, 128, 12
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("net", choices=("xs", "s", "m"), help="which network")
     parser.add_argument("--pictures", required=True, help="folder of clean pictures to train on")
     parser.add_argument(
         "--data", default="photographs of a user's folder, rendered text", help="what the card says of it"
@@ -39,22 +40,23 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
 
-    last = options.output / "checkpoints" / "last.ckpt"
+    output = options.output / options.net
+    last = output / "checkpoints" / "last.ckpt"
     arguments = [
-        "experiment=small",
+        f"experiment={options.net}",
         f"data.folders=[{Path(options.pictures).resolve()}]",
         f"threads={options.threads}",
-        f"output={options.output}",
+        f"output={output}",
     ]
     if last.is_file():
         arguments.append(f"resume={last.resolve()}")
     subprocess.run([sys.executable, "-m", "turbnet", "train", *arguments], check=True)
 
     network, hyper_parameters = load_network(last)
-    steps = read_steps(options.output / "csv")
+    steps = read_steps(output / "csv")
     hyper_parameters["recipe"] = {
         "data": options.data,
-        "recipe": "python tools/train_released.py --pictures FOLDER",
+        "recipe": f"python tools/train_released.py {options.net} --pictures FOLDER",
         "steps": steps,
         "history": options.history,
     }
@@ -65,7 +67,7 @@ def main() -> None:
         f"{CLIPS} still scenes of {SIZE} x {SIZE} each, {FRAMES} frames that see independent atmospheres, read noise 1 %: "
         "two pictures of scikit-image that were never trained on, and rendered text; mean +- standard error over clips"
     )
-    path = options.weights / "small.onnx"
+    path = options.weights / f"{options.net}.onnx"
     for row in export_onnx(network, card_of(network, hyper_parameters, WINDOW), path):
         print(f"{row.shape}: largest difference from torch {row.difference:.1e}")
     Model.load(path).card.write_beside(path)

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from turbnet.data.clips import CleanClips, EpochSampler
+from turbnet.data.clips import CleanClips, EpochSampler, SimulatedClips
 from turbnet.data.module import ClipData
+from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Text
 from turbnet.errors import InputError, ParameterError
 
@@ -140,3 +141,33 @@ class TestClipData:
     def test_bad_settings(self, bad, says):
         with pytest.raises(InputError, match=says):
             ClipData(**{**self.small, **bad})
+
+
+class TestFramesAndHardness:
+    source = staticmethod(lambda rng, height, width: rng.random((height, width, 3), dtype=np.float32))
+
+    def test_the_clips_of_a_batch_share_their_number_of_frames_and_batches_differ(self):
+        clips = CleanClips(self.source, 40, (1, 9), 8, 8, batch=4)
+        counts = [len(clips[index]["scene"]) for index in range(400)]
+        assert all(len(set(counts[k : k + 4])) == 1 for k in range(0, 400, 4))
+        assert set(counts) == set(range(1, 10))
+
+    def test_hardness_rises_from_a_quarter_to_one(self):
+        clips = CleanClips(self.source, 40, 1, 8, 8, curriculum=10)
+        found = [float(clips[index]["hardness"]) for index in (0, 5, 10, 1000)]
+        assert found == pytest.approx([0.25, 0.625, 1.0, 1.0])
+        assert float(CleanClips(self.source, 40, 1, 8, 8)[0]["hardness"]) == 1
+
+    def test_simulated_where_they_are_made_they_are_the_same_pairs(self):
+        clips = CleanClips(self.source, 4, 2, 16, 16, moving=0.5)
+        maker = PairMaker(16, 16, modes=6, components=2, d_over_r0=(1.0, 4.0), blurred=1.0, compressed=1.0)
+        for index in range(2):
+            clean, seen = clips[index], SimulatedClips(clips, maker)[index]
+            pair = maker(clean["scene"][None], [int(clean["seed"])])
+            for name in ("frames", "target", "blur_only", "tilt"):
+                assert torch.equal(seen[name], getattr(pair, name)[0]), name
+
+    @pytest.mark.parametrize("frames", [(3, 2), (0, 2)])
+    def test_a_range_that_is_none(self, frames):
+        with pytest.raises(ParameterError, match="frames"):
+            CleanClips(self.source, 4, frames, 8, 8)

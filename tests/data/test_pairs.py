@@ -2,7 +2,7 @@ import pytest
 import skimage.data
 import torch
 
-from turbnet.data.pairs import PairMaker
+from turbnet.data.pairs import PairMaker, defocused
 from turbnet.errors import InputError, ParameterError
 from turbnet.media.colour import to_linear
 from turbnet.simulate.tilt import sample
@@ -151,3 +151,24 @@ def test_out_of_range(name, value):
 def test_clips_of_another_size(maker):
     with pytest.raises(InputError, match="expects"):
         maker(torch.rand(1, 2, 3, 32, 64), [0])
+
+
+def test_defocus_is_a_gaussian_of_its_width():
+    """The variance of a point's picture is sigma^2 in each axis (less than 2 % lies beyond three sigma)."""
+    point = torch.zeros(1, 1, 1, 41, 41)
+    point[..., 20, 20] = 1
+    seen = defocused(point, 2.5)[0, 0, 0]
+    x = torch.arange(41.0) - 20
+    assert float(seen.sum()) == pytest.approx(1, abs=1e-5)
+    assert float((seen.sum(0) * x**2).sum()) == pytest.approx(2.5**2, rel=0.04)
+
+
+def test_hardness_narrows_the_range_of_strengths():
+    maker = PairMaker(16, 16, modes=6, components=2, d_over_r0=(1.0, 5.0), blurred=0.5, compressed=0.5)
+    drawn = [maker.conditions(seed, 0.25) for seed in range(200)]
+    assert 1 <= min(c.d_over_r0 for c in drawn) < 1.1 < 1.9 < max(c.d_over_r0 for c in drawn) <= 2
+    # Half of 200: 3.5 deviations of sqrt(50).
+    assert sum(c.defocus > 0 for c in drawn) == pytest.approx(100, abs=25)
+    assert sum(c.sensor.jpeg is not None for c in drawn) == pytest.approx(100, abs=25)
+    with pytest.raises(ParameterError, match="hardness"):
+        maker.conditions(0, 1.5)

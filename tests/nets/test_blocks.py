@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from turbnet.nets.blocks import ChannelNorm, GatedConv, each_frame, warp
+from turbnet.nets.blocks import ChannelNorm, ResidualBlock, each_frame, warp
 
 
 class TestChannelNorm:
@@ -58,8 +58,8 @@ class TestWarp:
         assert torch.autograd.gradcheck(warp, (image, flow), eps=1e-2, atol=2e-2, rtol=1e-2)
 
 
-def test_gated_conv_keeps_the_shape():
-    assert GatedConv(6)(torch.rand(2, 6, 5, 3)).shape == (2, 6, 5, 3)
+def test_residual_block_keeps_the_shape():
+    assert ResidualBlock(6)(torch.rand(2, 6, 5, 3)).shape == (2, 6, 5, 3)
 
 
 def test_each_frame_sees_frames_alone():

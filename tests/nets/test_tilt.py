@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from turbnet.data.pairs import PairMaker
 from turbnet.nets.blocks import warp
 from turbnet.nets.lucas_kanade import lucas_kanade
-from turbnet.nets.tilt import SCALES, TiltNet
+from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, TiltNet, weighted_mean
 
 
 def trained(seed: int = 0) -> TiltNet:
@@ -16,6 +16,8 @@ def trained(seed: int = 0) -> TiltNet:
     with torch.no_grad():
         for level in net.levels:
             level.correction.weight.normal_(std=0.1)
+            level.gate.weight.normal_(std=0.1)
+            level.certainty.weight.normal_(std=0.1)
     return net.eval()
 
 
@@ -24,6 +26,9 @@ def test_shapes(batch, frames, height, width):
     out = trained()(torch.rand(batch, frames, 3, height, width))
     assert out.frames.shape == (batch, frames, 3, height, width)
     assert [tuple(t.shape) for t in out.tilts] == [(batch, frames, 2, height // s, width // s) for s in SCALES]
+    assert [tuple(z.shape) for z in out.logits] == [(batch, frames, 1, height // s, width // s) for s in SCALES]
+    assert out.confidence.shape == (batch, frames, 1, height, width)
+    assert out.reference.shape == (batch, 1, 3, height, width)
 
 
 @torch.no_grad()
@@ -55,7 +60,8 @@ def lucas_kanade_pyramid(frames: torch.Tensor) -> torch.Tensor:
         else:
             tilt = F.interpolate(tilt, scale_factor=2, mode="bilinear", align_corners=False)
         registered = warp(small, tilt / scale)
-        tilt = tilt + scale * lucas_kanade(registered, registered.mean(0, keepdim=True), torch.tensor(-7.0).exp())
+        step = lucas_kanade(registered, registered.mean(0, keepdim=True), torch.tensor(-7.0).exp())
+        tilt = tilt + scale * torch.sigmoid(torch.tensor(3.0)) * step
     return tilt
 
 
@@ -92,8 +98,32 @@ def test_untrained_it_halves_the_tilt_and_the_distance_to_the_blur_only_frames(p
 def test_every_weight_learns(pair):
     net = trained()
     out = net(pair.frames[:1, :3])
-    (out.frames.square().mean() + sum(t.square().mean() for t in out.tilts)).backward()
+    (out.reference.square().mean() + sum(t.square().mean() for t in out.tilts) + out.logits[-1].mean()).backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
         assert torch.isfinite(parameter.grad).all(), name
         assert parameter.grad.abs().sum() > 0, name
+
+
+@torch.no_grad()
+def test_what_passes_through_weighs_little_in_the_reference():
+    """One frame of three is another picture; where confidence says so, the reference is the mean of the other two."""
+    still, other = torch.rand(1, 1, 3, 8, 8), torch.rand(1, 1, 3, 8, 8)
+    clip, logits = torch.cat((still, other, still), 1), torch.tensor([4.0, -20.0, 4.0]).view(1, 3, 1, 1, 1)
+    torch.testing.assert_close(weighted_mean(clip, logits.expand(1, 3, 1, 8, 8)), still, rtol=0, atol=1e-6)
+    torch.testing.assert_close(weighted_mean(clip, 0 * logits), clip.mean(1, keepdim=True))
+
+
+@torch.no_grad()
+def test_confidence_is_one_half_where_the_expected_error_is_half_a_pixel():
+    out = TiltNet(widths=(4, 4, 4))(torch.rand(1, 2, 3, 16, 16))
+    torch.testing.assert_close(out.confidence, torch.full((1, 2, 1, 16, 16), 0.5))
+    assert ERROR_AT_HALF == 0.5
+
+
+@torch.no_grad()
+def test_a_single_frame_is_its_own_reference_and_stays():
+    frame = torch.rand(1, 1, 3, 24, 24)
+    out = TiltNet()(frame)
+    torch.testing.assert_close(out.frames, frame, rtol=0, atol=1e-5)
+    torch.testing.assert_close(out.reference, out.frames, rtol=0, atol=1e-6)

@@ -162,7 +162,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(place):
         (["--dataset", "bad", *SMALL, "independent=2"], "independent = 2"),
         (["--dataset", "bad", *SMALL, "strength=2"], "its keys are d_over_r0"),
         (["--dataset", "bad", *SMALL, "height=2"], "its keys are d_over_r0"),
-        (["--dataset", "bad", *SMALL, "--simulator", "huge"], "path7km weak wide"),
+        (["--dataset", "bad", *SMALL, "--simulator", "huge"], "path7km recipe weak wide"),
         (["--dataset", "bad", *SMALL, "--size", "wide"], "--size wide"),
         (["--dataset", "bad", *SMALL, "--size", "0x8"], "height = 0"),
         (["--dataset", "bad", *SMALL, "--samples", 0], "samples = 0"),

@@ -11,7 +11,8 @@ from turbnet.tasks.losses import registration_loss
 from turbnet.tasks.restoration import Restoration
 from turbnet.tasks.tilt import TiltRemoval
 
-NET = {"name": "restorer", "tilt": {"widths": [8, 8, 8]}, "tcja": {"width": 16, "depth": 1}}
+SCENE = {"widths": [8, 12, 16], "depths": [1, 1, 1]}
+NET = {"name": "restorer", "tilt": {"widths": [8, 8, 8]}, "tcja": {"width": 16, "depth": 1}, "scene": SCENE}
 SIMULATOR = {"height": 32, "width": 32, "modes": 10, "components": 3, "read_noise": [0.0, 0.0]}
 
 
@@ -25,7 +26,7 @@ def make(kind, d_over_r0=(3.0, 3.0), **more):
 @pytest.fixture
 def batch():
     picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
-    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3])}
+    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3]), "hardness": torch.tensor([1.0])}
 
 
 def learn(task, batch, steps, rate):
@@ -75,8 +76,8 @@ def test_gradients_are_finite(kind, strength, batch):
     ("task", "learns"),
     [
         (make(TiltRemoval), {"tilt"}),
-        (make(Restoration), {"tilt", "tcja"}),
-        (make(Restoration, freeze_tilt=True), {"tcja"}),
+        (make(Restoration), {"tilt", "tcja", "fusion", "scene", "own"}),
+        (make(Restoration, freeze_tilt=True), {"tcja", "fusion", "scene", "own"}),
     ],
 )
 def test_what_a_task_learns(task, learns, batch):
@@ -88,11 +89,13 @@ def test_what_a_task_learns(task, learns, batch):
 
 
 def test_frozen_tilts_have_no_weight_in_the_loss(batch):
-    from turbnet.tasks.losses import charbonnier
+    from turbnet.tasks.losses import charbonnier, frequency_loss
 
     task = make(Restoration, freeze_tilt=True)
     pair = task.pair(batch)
-    assert task.training_step(batch, 0) == charbonnier(task.net(pair.frames), pair.target)
+    restored = task.net(pair.frames)
+    expected = charbonnier(restored, pair.target) + 0.1 * frequency_loss(restored, pair.target)
+    assert task.training_step(batch, 0) == expected
 
 
 @pytest.mark.parametrize("kind", [TiltRemoval, Restoration])

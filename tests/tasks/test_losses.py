@@ -4,8 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from turbnet.nets.tilt import SCALES
-from turbnet.tasks.losses import charbonnier, psnr, registration_loss, tilt_loss
+from turbnet.nets.tilt import SCALES, Registered
+from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, registration_loss, tilt_error, tilt_loss
 
 
 def test_charbonnier():
@@ -71,9 +71,34 @@ class TestAtTheTruth:
             )
 
     def test_tilt_loss(self):
+        """-log p up to a constant: |e| e^z / b_0 - z, the error being the length of a vector."""
         truth = torch.randn(1, 3, 2, 32, 32)
-        tilts = [F.avg_pool2d(truth[0], s)[None] for s in SCALES]
-        assert float(tilt_loss(tilts, truth)) == pytest.approx(0.1, rel=1e-5)  # epsilon
-        off = [t + 3 for t in tilts]
-        assert float(tilt_loss(off, truth)) == pytest.approx(math.hypot(3, 0.1), rel=1e-4)
-        assert float(tilt_loss([off[0], *tilts[1:]], truth)) == pytest.approx((math.hypot(3, 0.1) + 0.2) / 3, rel=1e-4)
+        exact = [F.avg_pool2d(truth[0], s)[None] for s in SCALES]
+        zero = [torch.zeros_like(t[:, :, :1]) for t in exact]
+
+        def loss(tilts, logits):
+            return float(tilt_loss(Registered(truth, tilts, logits, truth), truth))
+
+        assert loss(exact, zero) == pytest.approx(0.05 / 0.5, rel=1e-4)
+        off = [t + 3 for t in exact]
+        assert loss(off, zero) == pytest.approx(math.hypot(3, 3, 0.05) / 0.5, rel=1e-4)
+        assert loss([off[0], *exact[1:]], zero) == pytest.approx((math.hypot(3, 3, 0.05) + 0.1) / 0.5 / 3, rel=1e-4)
+        # The right scale of the error, b = |e|, is the best.
+        right = math.log(0.5 / math.hypot(3, 3))
+        best, *worse = (loss(off, [z + right + shift for z in zero]) for shift in (0.0, -0.5, 0.5))
+        assert best == pytest.approx(1 - right, rel=1e-3)
+        assert all(other > best for other in worse)
+
+    def test_tilt_error(self):
+        truth = torch.randn(1, 3, 2, 32, 32)
+        off = [F.avg_pool2d(truth[0], s)[None] + 2 for s in SCALES]
+        assert float(tilt_error(Registered(truth, off, [], truth), truth)) == pytest.approx(2, rel=1e-5)
+
+    def test_frequency_loss(self):
+        """Of white noise of deviation s: each coefficient is complex normal, its mean modulus s sqrt(pi) / 2."""
+        a = torch.rand(1, 2, 3, 64, 64)
+        assert float(frequency_loss(a, a)) == pytest.approx(1e-4, rel=1e-3)
+        noise = 0.1 * torch.randn(4, 4, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+        expected = 0.1 * math.sqrt(math.pi) / 2
+        # 100,000 moduli, relative deviation 0.52 each; few frequencies are real and have another mean.
+        assert float(frequency_loss(a[:, :1] + noise, a[:, :1].expand_as(noise))) == pytest.approx(expected, rel=0.01)

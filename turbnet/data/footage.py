@@ -61,7 +61,7 @@ class Footage(Dataset[Scene]):
         with open_clip(self.paths[which], (left, top, self.width, self.height)) as clip:
             cut = np.stack(list(islice(clip, first, first + self.frames)))
         scene = torch.from_numpy(cut).permute(0, 3, 1, 2).clamp(0, 1).contiguous()
-        return {"scene": scene, "seed": torch.tensor(int(rng.integers(2**62)))}
+        return {"scene": scene, "seed": torch.tensor(int(rng.integers(2**62))), "hardness": torch.tensor(1.0)}
 
     def _room_in(self, path: Path) -> tuple[int, int, int]:
         """By how much a cut may start late, low and far right."""

@@ -1,13 +1,16 @@
 """Clean clips for training and validation, as Lightning wants them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 from torch.utils.data import DataLoader
 
-from turbnet.data.clips import CleanClips, EpochSampler, Scene
+from turbnet.data.clips import CleanClips, EpochSampler, SimulatedClips
+from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Mixture, Pictures, Source, Text, embedded_paths, folder_paths
+from turbnet.data.text_scenes import TextScenes
 from turbnet.errors import InputError, ParameterError, check_range
 
 
@@ -15,16 +18,20 @@ class ClipData(L.LightningDataModule):
     """Clips of crops from pictures and rendered text.
 
     Args:
-        frames, size: of a clip; crops are size x size pixels.
+        frames: of a clip; two numbers: a range to draw from for every training step, the largest for validation.
+        size: crops are size x size pixels.
         batch_size: clips of a step, in each process.
         steps_per_epoch: training steps of an epoch, which several processes share; every epoch brings fresh clips.
         folders: of the user's pictures, searched recursively; empty: the pictures embedded in scikit-image.
         val_folders: the same for validation.
-        text: fraction of clips with rendered text.
+        text: fraction of clips with rendered text: half of them scenes of it, half filled with it.
         moving: fraction of clips with something that moves.
         scales: range of the factor by which pictures are reduced before cropping.
         val_clips: clips to validate on, always the same.
+        curriculum: training steps over which strength rises from a quarter of its range to all of it.
         workers: processes that make clips; the clips do not depend on their number.
+        simulator: arguments of `turbnet.data.pairs.PairMaker`: turbulence is then simulated here, in the workers, and not
+            in the training loop. The pairs are the same; worth it where the loop runs on a GPU or few cores idle.
         seed: of the clips.
 
     Raises:
@@ -33,7 +40,7 @@ class ClipData(L.LightningDataModule):
 
     def __init__(
         self,
-        frames: int = 8,
+        frames: int | Sequence[int] = 8,
         size: int = 128,
         batch_size: int = 4,
         steps_per_epoch: int = 100,
@@ -43,7 +50,9 @@ class ClipData(L.LightningDataModule):
         moving: float = 0.25,
         scales: Sequence[float] = (0.5, 1.0),
         val_clips: int = 8,
+        curriculum: int = 0,
         workers: int = 0,
+        simulator: Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -59,29 +68,36 @@ class ClipData(L.LightningDataModule):
         ranges = (float(scales[0]), float(scales[1]))
 
         def source(paths: list[Path]) -> Source:
-            return Mixture([Pictures(paths, ranges), Text()], [1 - text, text])
+            return Mixture([Pictures(paths, ranges), TextScenes(), Text()], [1 - text, text / 2, text / 2])
 
         train = source(folder_paths(folders) if folders else embedded_paths("train"))
         val = source(folder_paths(val_folders) if val_folders else embedded_paths("test"))
+        self.curriculum, self.simulator = curriculum, simulator
+        self.pairs: PairMaker | None = None
+        most = frames if isinstance(frames, int) else frames[-1]
         self.train = CleanClips(train, steps_per_epoch * batch_size, frames, size, size, moving, seed)
         # Another seed than training's, and the same whatever training's is.
-        self.val = CleanClips(val, val_clips, frames, size, size, moving, 2**31 - 1)
+        self.val = CleanClips(val, val_clips, most, size, size, moving, 2**31 - 1)
 
-    def _loader(self, clips: CleanClips, sampler: EpochSampler | None) -> DataLoader[Scene]:
+    def _loader(self, clips: CleanClips, sampler: EpochSampler | None) -> DataLoader[Any]:
+        if self.simulator is not None and self.pairs is None:
+            self.pairs = PairMaker(**self.simulator)
         return DataLoader(
-            clips,
+            clips if self.pairs is None else SimulatedClips(clips, self.pairs),
             batch_size=self.batch_size,
             sampler=sampler,
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
         )
 
-    def train_dataloader(self) -> DataLoader[Scene]:
+    def train_dataloader(self) -> DataLoader[Any]:
         """Fresh clips every epoch."""
         rank = self.trainer.global_rank if self.trainer else 0
         world = self.trainer.world_size if self.trainer else 1
+        self.train.batch = self.batch_size * world
+        self.train.curriculum = self.curriculum * self.train.batch
         return self._loader(self.train, EpochSampler(len(self.train), rank, world))
 
-    def val_dataloader(self) -> DataLoader[Scene]:
+    def val_dataloader(self) -> DataLoader[Any]:
         """The same clips every time."""
         return self._loader(self.val, None)

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
 import torch
+from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
-from turbnet.errors import ParameterError
+from turbnet.errors import ParameterError, check_range
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.simulate.ranges import Conditions, Ranges
 from turbnet.simulate.simulator import Simulator
@@ -53,28 +55,42 @@ class PairMaker(nn.Module):
         **ranges: Any,
     ) -> None:
         super().__init__()
-        whole = {"height": height, "width": width, "modes": modes, "stride": stride, "components": components}
-        for name, value in {**whole, "margin": margin or 0}.items():
-            if not isinstance(value, int):
-                raise ParameterError(f"{name} = {value!r} must be a whole number")
-        self.ranges = Ranges(**ranges)
+        self.ranges = self.check(height, width, modes, stride, components, margin, **ranges)
         self.simulators = nn.ModuleList(
             Simulator(path, height, width, modes, stride, components, self.ranges.strengths, margin=margin)
             for path in self.ranges.paths()
         )
 
-    def conditions(self, seed: int) -> Conditions:
+    @staticmethod
+    def check(
+        height: int,
+        width: int,
+        modes: int = 36,
+        stride: int = 8,
+        components: int = 8,
+        margin: int | None = 8,
+        **ranges: Any,
+    ) -> Ranges:
+        """The ranges of these arguments, the simulators not built; raises what the constructor raises."""
+        whole = {"height": height, "width": width, "modes": modes, "stride": stride, "components": components}
+        for name, value in {**whole, "margin": margin or 0}.items():
+            if not isinstance(value, int):
+                raise ParameterError(f"{name} = {value!r} must be a whole number")
+        return Ranges(**ranges)
+
+    def conditions(self, seed: int, hardness: float = 1.0) -> Conditions:
         """What the clip of this seed is seen through."""
-        return self.ranges.sample(torch.Generator().manual_seed(int(seed)))
+        return self.ranges.sample(torch.Generator().manual_seed(int(seed)), check_range("hardness", hardness, 0, 1))
 
     @torch.no_grad()
-    def forward(self, scene_BTCHW: Tensor, seeds: Sequence[int]) -> Pair:
+    def forward(self, scene_BTCHW: Tensor, seeds: Sequence[int], hardness: Sequence[float] | None = None) -> Pair:
         """Look at each clean sRGB clip through an atmosphere of its own.
 
         The camera points at the clip's mean position: a shift common to all frames cannot be told from another aim.
         """
-        clean = to_linear(scene_BTCHW)
-        made = [self._clip(scene, self.conditions(seed)) for scene, seed in zip(clean.split(1), seeds, strict=True)]
+        clean, hardness = to_linear(scene_BTCHW), hardness or [1.0] * len(seeds)
+        conditions = [self.conditions(*drawn) for drawn in zip(seeds, hardness, strict=True)]
+        made = [self._clip(scene, through) for scene, through in zip(clean.split(1), conditions, strict=True)]
         frames, blur_only, tilt = (torch.cat(parts) for parts in zip(*made, strict=True))
         return Pair(to_srgb(frames.clamp(0, 1)), scene_BTCHW, to_srgb(blur_only.clamp(0, 1)), tilt)
 
@@ -86,4 +102,15 @@ class PairMaker(nn.Module):
             [seen_through.draw_seed], scene_1TCHW.shape[1], wind, self.ranges.frame_rate, strength
         ).centred()
         seen = simulator(scene_1TCHW, draw)
-        return seen_through.sensor(seen.frames, seen_through.noise_seed), seen.blur_only, seen.tilt
+        frames, blur_only = seen.frames, seen.blur_only
+        if seen_through.defocus > 0:
+            frames, blur_only = (defocused(clip, seen_through.defocus) for clip in (frames, blur_only))
+        return seen_through.sensor(frames, seen_through.noise_seed), blur_only, seen.tilt
+
+
+def defocused(clip_BTCHW: Tensor, sigma: float) -> Tensor:
+    """Every frame through a Gaussian of RMS width `sigma` pixels in each axis; no wider than the frame allows."""
+    reach = min(int(np.ceil(3 * sigma)), min(clip_BTCHW.shape[-2:]) - 1)
+    size = 2 * reach + 1
+    flat = gaussian_blur2d(clip_BTCHW.flatten(0, 1), (size, size), (sigma, sigma))
+    return flat.unflatten(0, clip_BTCHW.shape[:2])

@@ -8,9 +8,10 @@ a pixel attend to each other jointly:
 
 with normalised q and k and a bounded temperature tau, so that the logits are bounded whatever the input. Turbulence
 sharpens and blurs each frame at other places; attention over time picks, pixel by pixel, the frames that saw this place
-well. Space is mixed by convolutions only, so the result at a pixel does not depend on how a picture is tiled beyond their
-reach, and any number of frames can be given. After TMT (Zhang et al., IEEE TCI 2024), whose attention is global in space
-and fixes the number of frames.
+well. The reference that all frames were registered to takes part as a frame of its own: what it gathers is the still
+scene, once for the whole clip. Space is mixed by convolutions only, so the result at a pixel does not depend on how a
+picture is tiled beyond their reach, and any number of frames can be given. After TMT (Zhang et al., IEEE TCI 2024), whose
+attention is global in space and fixes the number of frames.
 """
 
 import torch
@@ -18,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbnet.errors import ParameterError
-from turbnet.nets.blocks import ChannelNorm, GatedConv, each_frame, zero_start
+from turbnet.nets.blocks import ChannelNorm, ResidualBlock, conv3x3, each_frame
 
 _LOG_TEMPERATURE_MAX = 3.5  # logits within +-33: softmax stays well conditioned in every dtype
 
@@ -29,6 +30,9 @@ class JointAttention(nn.Module):
     Args:
         channels: C of the features.
         groups: G, tokens a frame at each pixel.
+
+    Raises:
+        ParameterError: groups that do not divide the channels.
     """
 
     def __init__(self, channels: int, groups: int = 2) -> None:
@@ -37,22 +41,22 @@ class JointAttention(nn.Module):
             raise ParameterError(f"groups = {groups} must divide channels = {channels}")
         self.groups = groups
         self.expand = nn.Conv2d(channels, 3 * channels, 1)
-        self.mix = nn.Conv2d(3 * channels, 3 * channels, 3, padding=1, groups=3 * channels)
         self.project = nn.Conv2d(channels, channels, 1)
         self.log_temperature = nn.Parameter(torch.full((groups, 1), 1.5))
 
     def forward(self, x_BTCHW: Tensor) -> Tensor:
         batch, frames, channels, height, width = x_BTCHW.shape
-        qkv = self.mix(self.expand(x_BTCHW.flatten(0, 1)))
-        # Pixels first, channels last, in one cheap transpose; then a token is a (frame, group) of a pixel.
-        tokens = qkv.reshape(batch, frames * 3 * channels, height * width).transpose(1, 2)
+        qkv = self.expand(x_BTCHW.flatten(0, 1)).permute(0, 2, 3, 1)
+        # Pixels first; then a token is a (frame, group) of a pixel.
+        tokens = qkv.reshape(batch, frames, height * width, 3 * channels).transpose(1, 2)
         tokens = tokens.reshape(batch * height * width, frames, 3, channels)
         q, k, v = (part.reshape(-1, frames * self.groups, channels // self.groups) for part in tokens.unbind(2))
         temperature = self.log_temperature.clamp(max=_LOG_TEMPERATURE_MAX).exp().repeat(frames, 1)
         q, k = _unit(q) * temperature, _unit(k)
         weights = torch.softmax(q @ k.transpose(-2, -1), dim=-1).to(v.dtype)
-        out = (weights @ v).reshape(batch, height * width, frames * channels).transpose(1, 2)
-        return each_frame(self.project, out.reshape(batch, frames, channels, height, width))
+        out = (weights @ v).reshape(batch, height * width, frames, channels).transpose(1, 2)
+        out = out.reshape(batch * frames, height, width, channels).permute(0, 3, 1, 2)
+        return self.project(out).unflatten(0, (batch, frames))
 
 
 def _unit(x: Tensor) -> Tensor:
@@ -62,63 +66,49 @@ def _unit(x: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    def __init__(self, channels: int, groups: int, expansion: float) -> None:
+    def __init__(self, channels: int, groups: int) -> None:
         super().__init__()
-        self.norm1, self.norm2 = ChannelNorm(channels), ChannelNorm(channels)
+        self.norm = ChannelNorm(channels)
         self.attention = JointAttention(channels, groups)
-        self.feed = GatedConv(channels, expansion)
+        self.feed = ResidualBlock(channels)
 
     def forward(self, x_BTCHW: Tensor) -> Tensor:
-        x = x_BTCHW + self.attention(each_frame(self.norm1, x_BTCHW))
-        batch, frames = x.shape[:2]
-        flat = x.flatten(0, 1)
-        return (flat + self.feed(self.norm2(flat))).unflatten(0, (batch, frames))
+        x = x_BTCHW + self.attention(each_frame(self.norm, x_BTCHW))
+        return each_frame(self.feed, x)
 
 
 class TCJATransformer(nn.Module):
-    """Restores every frame of a registered clip from all of them.
+    """Features of the reference and of every registered frame, each told by all the others.
 
-    Works on `patch` x `patch` pixels folded into channels. The result is a correction to a blend of the frame and the
-    temporal mean; the blend is decided per pixel, so that what moves is kept from the mean.
+    Works on `patch` x `patch` pixels folded into channels.
 
     Args:
         width: channels of the features.
         depth: attention blocks.
         groups: channel groups that attend as tokens of their own.
         patch: pixels folded into channels along each axis.
-        expansion: of the feed-forward parts.
         channels: of the frames.
     """
 
-    def __init__(
-        self,
-        width: int = 48,
-        depth: int = 4,
-        groups: int = 2,
-        patch: int = 4,
-        expansion: float = 2.0,
-        channels: int = 3,
-    ) -> None:
+    def __init__(self, width: int = 48, depth: int = 3, groups: int = 2, patch: int = 4, channels: int = 3) -> None:
         super().__init__()
         self.size_multiple = patch
-        self.patch = patch
-        folded = channels * patch**2
-        self.embed = nn.Conv2d(2 * folded, width, 3, padding=1, padding_mode="replicate")
-        self.blocks = nn.ModuleList(_Block(width, groups, expansion) for _ in range(depth))
-        self.correct = nn.Conv2d(width, folded, 3, padding=1, padding_mode="replicate")
-        self.gate = nn.Conv2d(width, patch**2, 3, padding=1, padding_mode="replicate")
-        zero_start(self.correct)
-        zero_start(self.gate, bias=-1.5)  # near the temporal mean
+        self.width, self.patch = width, patch
+        self.embed = conv3x3((2 * channels + 1) * patch**2, width)
+        self.mark = nn.Parameter(torch.zeros(width, 1, 1))  # tells the reference from the frames
+        self.blocks = nn.ModuleList(_Block(width, groups) for _ in range(depth))
 
-    def forward(self, frames_BTCHW: Tensor) -> Tensor:
+    def forward(self, reference_B1CHW: Tensor, frames_BTCHW: Tensor, confidence_BT1HW: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of the reference (B, C, H/p, W/p) and of the frames (B, T, C, H/p, W/p)."""
         batch, count = frames_BTCHW.shape[:2]
-        mean = frames_BTCHW.mean(dim=1, keepdim=True)
-        departure = frames_BTCHW - mean
-        pair = torch.cat((frames_BTCHW, departure), dim=2).flatten(0, 1)
-        features = self.embed(F.pixel_unshuffle(pair, self.patch)).unflatten(0, (batch, count))
+        departure = frames_BTCHW - reference_B1CHW
+        frames = torch.cat((frames_BTCHW, departure, confidence_BT1HW.to(departure.dtype)), dim=2)
+        still = torch.cat(
+            (reference_B1CHW, torch.zeros_like(reference_B1CHW), torch.ones_like(reference_B1CHW[:, :, :1])), dim=2
+        )
+        clip = F.pixel_unshuffle(torch.cat((still, frames), dim=1).flatten(0, 1), self.patch)
+        features = self.embed(clip).unflatten(0, (batch, count + 1))
+        features = torch.cat((features[:, :1] + self.mark.to(features.dtype), features[:, 1:]), dim=1)
         for block in self.blocks:
             features = block(features)
-        flat = features.flatten(0, 1)
-        correction = F.pixel_shuffle(self.correct(flat), self.patch).unflatten(0, (batch, count))
-        gate = torch.sigmoid(F.pixel_shuffle(self.gate(flat), self.patch)).unflatten(0, (batch, count))
-        return mean + gate * departure + correction
+        return features[:, 0], features[:, 1:]

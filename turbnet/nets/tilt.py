@@ -1,10 +1,15 @@
-"""Tilt removal: a multiscale network that registers the frames of a clip to their common, untilted geometry.
+r"""Tilt removal: a multiscale network that registers the frames of a clip to their common, untilted geometry.
 
 Turbulence moves the scene point u of frame t to u + t(u). The network estimates t coarse to fine (1/8, 1/4, 1/2 of the
-resolution) and undoes it by sampling each frame at x + t(x). At every level the reference is the temporal mean of the
-frames as registered so far, so it sharpens from level to level. A level takes the closed-form Lucas-Kanade step towards
-the reference and adds a learned correction; untrained, the network is a plain multiscale Lucas-Kanade registration.
-Nothing depends on the number of frames.
+resolution) and undoes it by sampling each frame at x + t(x). A level takes the closed-form Lucas-Kanade step towards a
+reference, lets a gate decide how much of it counts (what moves of itself is not to be held still), and adds a learned
+correction. It also says how sure it is, as the scale b of a Laplace distribution of the tilt's error:
+
+.. math::
+    p(t) \propto \frac{1}{b} e^{-|t - \hat t| / b}, \qquad b = b_0 e^{-z}, \qquad c = \frac{1}{1 + b / b_0} = \sigma(z)
+
+The reference is the mean of the frames as registered so far, each weighted by its confidence c: what passes through the
+scene weighs little in it, and it sharpens from level to level. Nothing depends on the number of frames.
 
 After the tilt-removal stage of TMT (Zhang et al., IEEE TCI 2024), which supervises three scales with blur-only frames;
 here the reference is explicit, the first guess is computed and not learned, and the frame count is free.
@@ -17,11 +22,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbnet.nets.blocks import warp, zero_start
+from turbnet.nets.blocks import conv3x3, warp, zero_start
 from turbnet.nets.lucas_kanade import lucas_kanade
 
 SCALES = (8, 4, 2)
 """Fractions of the resolution at which the tilt is estimated, coarse to fine."""
+
+ERROR_AT_HALF = 0.5
+"""b_0: the expected error of a tilt, pixels, at which confidence is one half."""
+
+_LARGEST_LOGIT = 4.0
 
 
 class Registered(NamedTuple):
@@ -31,10 +41,19 @@ class Registered(NamedTuple):
         frames: registered frames (B, T, C, H, W).
         tilts: estimates of the tilt map at 1/8, 1/4 and 1/2 of the resolution, each (B, T, 2, H/s, W/s), in full-resolution
             pixels.
+        logits: z of the confidence at the same scales, each (B, T, 1, H/s, W/s).
+        reference: mean of the registered frames by confidence, (B, 1, C, H, W).
     """
 
     frames: Tensor
     tilts: list[Tensor]
+    logits: list[Tensor]
+    reference: Tensor
+
+    @property
+    def confidence(self) -> Tensor:
+        """c at full resolution, (B, T, 1, H, W)."""
+        return torch.sigmoid(_enlarged(self.logits[-1].flatten(0, 1), SCALES[-1])).unflatten(0, self.frames.shape[:2])
 
 
 class _Level(nn.Module):
@@ -44,20 +63,29 @@ class _Level(nn.Module):
         super().__init__()
         self.log_prior = nn.Parameter(torch.tensor(-7.0))
         self.layers = nn.Sequential(
-            nn.Conv2d(2 * channels + 4, width, 3, padding=1, padding_mode="replicate"),
-            nn.GELU(),
-            nn.Conv2d(width, width, 3, padding=1, padding_mode="replicate"),
-            nn.GELU(),
-            nn.Conv2d(width, width, 3, padding=1, padding_mode="replicate"),
-            nn.GELU(),
+            conv3x3(2 * channels + 5, width),
+            nn.ReLU(),
+            conv3x3(width, width),
+            nn.ReLU(),
+            conv3x3(width, width),
+            nn.ReLU(),
         )
-        self.correction = nn.Conv2d(width, 2, 3, padding=1, padding_mode="replicate")
+        self.correction = conv3x3(width, 2)
+        self.gate = conv3x3(width, 1)
+        self.certainty = conv3x3(width, 1)
         zero_start(self.correction)
+        zero_start(self.gate, bias=3.0)  # nearly all of the closed-form step
+        zero_start(self.certainty)
 
-    def forward(self, registered_NCHW: Tensor, reference_NCHW: Tensor, tilt_N2HW: Tensor) -> Tensor:
+    def forward(
+        self, registered_NCHW: Tensor, reference_NCHW: Tensor, tilt_N2HW: Tensor, logit_N1HW: Tensor
+    ) -> tuple[Tensor, Tensor]:
         step = lucas_kanade(registered_NCHW, reference_NCHW, self.log_prior.clamp(-12.0, 0.0).exp())
         step = step.to(registered_NCHW.dtype)
-        return step + self.correction(self.layers(torch.cat((registered_NCHW, reference_NCHW, tilt_N2HW, step), dim=1)))
+        seen = torch.cat((registered_NCHW, reference_NCHW, tilt_N2HW, step, logit_N1HW), dim=1)
+        features = self.layers(seen)
+        moved = torch.sigmoid(self.gate(features)) * step + self.correction(features)
+        return moved, logit_N1HW + self.certainty(features)
 
 
 class TiltNet(nn.Module):
@@ -75,20 +103,36 @@ class TiltNet(nn.Module):
         self.levels = nn.ModuleList(_Level(channels, width) for width in widths)
 
     def forward(self, frames_BTCHW: Tensor) -> Registered:
-        batch, count, channels, height, width = frames_BTCHW.shape
+        batch, count, _, height, width = frames_BTCHW.shape
         frames = frames_BTCHW.flatten(0, 1)
-        tilt = frames.new_zeros((batch * count, 2, height // SCALES[0], width // SCALES[0]))
+        coarse = (height // SCALES[0], width // SCALES[0])
+        tilt, logit = frames.new_zeros((batch * count, 2, *coarse)), frames.new_zeros((batch * count, 1, *coarse))
         tilts: list[Tensor] = []
+        logits: list[Tensor] = []
         for scale, level in zip(SCALES, self.levels, strict=True):
             small = F.avg_pool2d(frames, scale)
             if tilts:
-                tilt = F.interpolate(tilt, scale_factor=2.0, mode="bilinear", align_corners=False)
+                tilt, logit = _enlarged(tilt, 2), _enlarged(logit, 2)
             registered = warp(small, tilt / scale)
-            clip = registered.unflatten(0, (batch, count))
-            reference = clip.mean(dim=1, keepdim=True).expand(clip.shape).flatten(0, 1)
+            reference = weighted_mean(registered.unflatten(0, (batch, count)), logit.unflatten(0, (batch, count)))
+            everywhere = reference.expand(batch, count, *reference.shape[2:]).flatten(0, 1)
             # Levels work in their own pixels, where a tilt is of order one.
-            tilt = tilt + scale * level(registered, reference, tilt / scale).to(tilt.dtype)
+            moved, logit = level(registered, everywhere, tilt / scale, logit)
+            tilt = tilt + scale * moved.to(tilt.dtype)
+            logit = logit.to(tilt.dtype).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
             tilts.append(tilt)
-        fine = F.interpolate(tilt, scale_factor=float(SCALES[-1]), mode="bilinear", align_corners=False)
-        out = warp(frames, fine)
-        return Registered(out.unflatten(0, (batch, count)), [t.unflatten(0, (batch, count)) for t in tilts])
+            logits.append(logit)
+        out = warp(frames, _enlarged(tilt, SCALES[-1])).unflatten(0, (batch, count))
+        reference = weighted_mean(out, _enlarged(logit, SCALES[-1]).unflatten(0, (batch, count)))
+        tilts, logits = ([x.unflatten(0, (batch, count)) for x in xs] for xs in (tilts, logits))
+        return Registered(out, tilts, logits, reference)
+
+
+def weighted_mean(frames_BTCHW: Tensor, logits_BT1HW: Tensor) -> Tensor:
+    """Mean over time by confidence, (B, 1, C, H, W)."""
+    weights = torch.sigmoid(logits_BT1HW.float())
+    return ((frames_BTCHW * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True)).to(frames_BTCHW.dtype)
+
+
+def _enlarged(x_NCHW: Tensor, factor: int) -> Tensor:
+    return F.interpolate(x_NCHW, scale_factor=float(factor), mode="bilinear", align_corners=False)

@@ -32,6 +32,8 @@ _LIMITS = {
     "aperture": (1e-3, 50.0, "m"),
     "distance": (1.0, 1e6, "m"),
     "wavelength": (1e-7, 2e-5, "m"),
+    "defocus": (0.0, 100.0, "pixels"),
+    "jpeg": (1, 100, ""),
 }
 
 
@@ -43,7 +45,8 @@ class Conditions:
         d_over_r0: strength of the turbulence.
         geometry: which of `Ranges.paths()`.
         wind: velocity of the air across the path, x and y, m/s; None: every frame sees an atmosphere of its own.
-        sensor: the camera's noise.
+        sensor: the camera's noise and compression.
+        defocus: RMS width of the Gaussian blur of the lens, pixels; 0 for none.
         draw_seed: of the atmosphere.
         noise_seed: of the sensor.
     """
@@ -52,6 +55,7 @@ class Conditions:
     geometry: int
     wind: tuple[float, float] | None
     sensor: Sensor
+    defocus: float
     draw_seed: int
     noise_seed: int
 
@@ -70,6 +74,10 @@ class Ranges:
         aperture, distance, wavelength: of the path, m, drawn uniformly in the logarithm; see `paths`.
         geometries: how many paths to draw. One stands in the (geometric) middle of the ranges.
         geometry_seed: of that draw.
+        defocus: RMS width of a Gaussian blur of the lens, the same in all frames, pixels, drawn uniformly.
+        blurred: fraction of clips that have it.
+        jpeg: quality of compression, drawn uniformly.
+        compressed: fraction of clips that are compressed.
         subframes: atmospheres averaged over the exposure of a frame. Reserved: 1, an instant exposure, is all there is.
 
     Raises:
@@ -87,6 +95,10 @@ class Ranges:
     wavelength: Range = 525e-9
     geometries: int = 1
     geometry_seed: int = 0
+    defocus: Range = (0.0, 3.0)
+    blurred: float = 0.0
+    jpeg: Range = (40, 95)
+    compressed: float = 0.0
     subframes: int = 1
 
     def __post_init__(self) -> None:
@@ -95,7 +107,8 @@ class Ranges:
         for name in ("geometries", "geometry_seed", "subframes"):
             if not isinstance(getattr(self, name), int):
                 raise ParameterError(f"{name} = {getattr(self, name)!r} must be a whole number")
-        check_range("independent", _number("independent", self.independent), 0, 1)
+        for name in ("independent", "blurred", "compressed"):
+            check_range(name, _number(name, getattr(self, name)), 0, 1)
         check_range("frame_rate", _number("frame_rate", self.frame_rate), 1e-3, 1e6, "frames a second")
         check_range("geometries", self.geometries, 1, 1000)
         check_range("geometry_seed", self.geometry_seed, 0, 2**63)
@@ -125,13 +138,18 @@ class Ranges:
         strongest = max(self.strengths[1], 1e-3)
         return [OpticalPath.from_d_over_r0(strongest, *map(float, one)) for one in zip(*drawn, strict=True)]
 
-    def sample(self, generator: torch.Generator) -> Conditions:
-        """The conditions of one clip; the generator decides everything."""
+    def sample(self, generator: torch.Generator, hardness: float = 1.0) -> Conditions:
+        """The conditions of one clip; the generator decides everything.
+
+        Args:
+            hardness: part of the range of D/r0 to draw from, 0 (the weakest alone) to 1 (all of it).
+        """
 
         def uniform(low: float, high: float) -> float:
             return low + (high - low) * float(torch.rand((), generator=generator))
 
-        strength = uniform(*self.strengths)
+        low, high = self.strengths
+        strength = uniform(low, low + hardness * (high - low))
         speed, direction = uniform(*self.wind), uniform(0, 2 * math.pi)  # type: ignore[misc]
         wind = None if uniform(0, 1) < self.independent else (speed * math.cos(direction), speed * math.sin(direction))
         read_noise = uniform(*self.read_noise)  # type: ignore[misc]
@@ -140,7 +158,11 @@ class Ranges:
         low, high = self.full_well  # type: ignore[misc]
         # A range of one number comes out as that very number, whatever 1 / (1 / x) rounds to.
         full_well = low if low == high else _inverse(uniform(1 / high, 1 / low))
-        return Conditions(strength, geometry, wind, Sensor(full_well, read_noise), draw_seed, noise_seed)
+        # Drawn last: clips of ranges without them are what they were before these came.
+        defocus, blurred = uniform(*self.defocus), uniform(0, 1) < self.blurred  # type: ignore[misc]
+        jpeg, compressed = round(uniform(*self.jpeg)), uniform(0, 1) < self.compressed  # type: ignore[misc]
+        sensor = Sensor(full_well, read_noise, jpeg=jpeg if compressed else None)
+        return Conditions(strength, geometry, wind, sensor, defocus if blurred else 0.0, draw_seed, noise_seed)
 
     def _geometric(self) -> list[tuple[float, float]]:
         return [self.aperture, self.distance, self.wavelength]  # type: ignore[list-item]

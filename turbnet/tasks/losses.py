@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbnet.nets.blocks import warp
-from turbnet.nets.tilt import SCALES
+from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, Registered
 
 
 def charbonnier(a: Tensor, b: Tensor, epsilon: float = 1e-3) -> Tensor:
@@ -37,11 +37,29 @@ def registration_loss(frames: Tensor, blur_only: Tensor, tilts: Sequence[Tensor]
     return loss / len(SCALES)
 
 
-def tilt_loss(tilts: Sequence[Tensor], tilt_map: Tensor) -> Tensor:
-    """Charbonnier distance of the estimated tilts to the true tilt map at each scale, pixels."""
+def tilt_loss(registered: Registered, tilt_map: Tensor) -> Tensor:
+    r"""Negative log-likelihood of the true tilt map, mean over three scales: |t - t^| e^z / b_0 - z.
+
+    The error |t - t^| is the length of the vector, pixels, rounded off below 0.05.
+    """
     truth = tilt_map.flatten(0, 1)
-    parts = [
-        charbonnier(tilt.flatten(0, 1), F.avg_pool2d(truth, scale), epsilon=0.1)
-        for scale, tilt in zip(SCALES, tilts, strict=True)
-    ]
+    parts = []
+    for scale, tilt, logit in zip(SCALES, registered.tilts, registered.logits, strict=True):
+        error = (tilt.float() - F.avg_pool2d(truth, scale).unflatten(0, tilt.shape[:2])).square().sum(2, keepdim=True)
+        length, z = torch.sqrt(error + 0.05**2), logit.float()
+        parts.append((length * z.exp() / ERROR_AT_HALF - z).mean())
     return torch.stack(parts).mean()
+
+
+def tilt_error(registered: Registered, tilt_map: Tensor) -> Tensor:
+    """Root mean square error of the finest tilts in one axis, pixels."""
+    scale, tilt = SCALES[-1], registered.tilts[-1]
+    return (
+        (tilt.float() - F.avg_pool2d(tilt_map.flatten(0, 1), scale).unflatten(0, tilt.shape[:2])).square().mean().sqrt()
+    )
+
+
+def frequency_loss(a: Tensor, b: Tensor) -> Tensor:
+    """Mean absolute difference of the (orthonormal) Fourier transforms: fine detail counts as much as coarse."""
+    difference = torch.fft.rfft2(a.float() - b.float(), norm="ortho")
+    return torch.sqrt(difference.real.square() + difference.imag.square() + 1e-8).mean()

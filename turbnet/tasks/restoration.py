@@ -5,9 +5,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from turbnet.data.clips import Scene
+from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.tasks.checkpoint import load_net
-from turbnet.tasks.losses import charbonnier, psnr, registration_loss, tilt_loss
+from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, registration_loss, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
 
 
@@ -15,8 +15,7 @@ class Restoration(SimulatedTask):
     """Trains a restorer: its frames are compared with the clean clip, its registration as in `TiltRemoval`.
 
     Args:
-        tilt_weight: weight of the tilt loss (pixels).
-        registration_weight: weight of the registration loss.
+        tilt_weight, registration_weight, frequency_weight: of the tilt, registration and frequency losses.
         freeze_tilt: keep the tilt net as it is; then its losses have no weight.
         start_from: checkpoint whose network to start from, such as one of `TiltRemoval`.
         more: see `SimulatedTask`.
@@ -24,8 +23,9 @@ class Restoration(SimulatedTask):
 
     def __init__(
         self,
-        tilt_weight: float = 0.01,
+        tilt_weight: float = 0.003,
         registration_weight: float = 0.2,
+        frequency_weight: float = 0.1,
         freeze_tilt: bool = False,
         start_from: str | None = None,
         **more: Any,
@@ -33,6 +33,7 @@ class Restoration(SimulatedTask):
         super().__init__(
             tilt_weight=tilt_weight,
             registration_weight=registration_weight,
+            frequency_weight=frequency_weight,
             freeze_tilt=freeze_tilt,
             **more,
         )
@@ -40,20 +41,22 @@ class Restoration(SimulatedTask):
             self.net.load_state_dict(load_net(start_from, expect=self.hparams["net"]))
 
     def trained(self) -> Iterable[nn.Parameter]:
-        """The network, or its transformer alone."""
-        part = self.net.tcja if self.hparams["freeze_tilt"] else self.net
-        return part.parameters()
+        """The network, or all of it but the tilt net."""
+        frozen = set(self.net.tilt.parameters()) if self.hparams["freeze_tilt"] else set()
+        return [parameter for parameter in self.net.parameters() if parameter not in frozen]
 
-    def step(self, batch: Scene, stage: str) -> Tensor:
+    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         pair = self.pair(batch)
-        restored, registered = self.net.stages(pair.frames)
-        loss = charbonnier(restored, pair.target)
-        values = {"charbonnier": loss}
+        stages = self.net.stages(pair.frames)
+        restored, registered = stages.frames, stages.registered
+        distance = charbonnier(restored, pair.target)
+        loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
+        values = {"charbonnier": distance}
         if not self.hparams["freeze_tilt"]:
-            error = tilt_loss(registered.tilts, pair.tilt)
-            distance = registration_loss(pair.frames, pair.blur_only, registered.tilts)
-            loss = loss + self.hparams["tilt_weight"] * error + self.hparams["registration_weight"] * distance
-            values["tilt_px"] = error
+            astray = registration_loss(pair.frames, pair.blur_only, registered.tilts)
+            loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
+            loss = loss + self.hparams["registration_weight"] * astray
+            values["tilt_px"] = tilt_error(registered, pair.tilt)
         values["loss"] = loss
         if stage == "val":
             values["psnr"] = psnr(restored, pair.target)

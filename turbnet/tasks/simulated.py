@@ -1,15 +1,17 @@
 """What every task shares that learns from simulated pairs: the simulator in the loop, the optimiser, the schedule."""
 
 import math
+import time
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities.rank_zero import rank_zero_warn
 from torch import Tensor, nn
 
-from turbnet.data.clips import Scene
+from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.data.pairs import Pair, PairMaker
 from turbnet.errors import InputError, check_range
 from turbnet.nets import build
@@ -70,8 +72,11 @@ class SimulatedTask(L.LightningModule):
                 raise InputError(
                     f"{side} of the clips = {simulator[side]} must be a multiple of {restorer.size_multiple}"
                 )
-        self.net = restorer
-        self.pairs = PairMaker(**simulator)
+        self.net = restorer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        PairMaker.check(**simulator)
+        self._pairs: list[PairMaker] = []  # built when first needed; a list, so as not to be part of the model
+        self._began = self._simulated = 0.0
+        self.skipped = 0
         self.net.requires_grad_(False)
         for parameter in self.trained():
             parameter.requires_grad_(True)
@@ -80,10 +85,39 @@ class SimulatedTask(L.LightningModule):
         """The parameters that this task learns."""
         return self.net.parameters()
 
-    def pair(self, batch: Scene) -> Pair:
-        """Turbulent clips for a batch of clean ones, always in float32."""
+    def pair(self, batch: Scene | SimulatedScene) -> Pair:
+        """Turbulent clips for a batch of clean ones, always in float32; those that a worker made pass through."""
+        if "frames" in batch:
+            return Pair(batch["frames"], batch["target"], batch["blur_only"], batch["tilt"])
+        began = time.perf_counter()
         with torch.autocast(self.device.type, enabled=False):
-            return self.pairs(batch["scene"].float(), batch["seed"].tolist())
+            if not self._pairs:
+                self._pairs.append(PairMaker(**self.hparams["simulator"]).to(self.device))
+            pair = self._pairs[0](batch["scene"].float(), batch["seed"].tolist(), batch["hardness"].tolist())
+        self._simulated += time.perf_counter() - began
+        return pair
+
+    def on_train_batch_start(self, batch: Scene | SimulatedScene, index: int) -> None:
+        """Notes when the step began; what it waited for before that is the data's time."""
+        self._simulated = 0.0
+
+    def on_train_batch_end(self, outputs: Any, batch: Scene | SimulatedScene, index: int) -> None:
+        """Logs clips a second and the part of a step that was spent in the simulator (in this process) so far."""
+        now = time.perf_counter()
+        if self._began:
+            step = now - self._began
+            self.log("speed/clips_per_second", len(batch["seed"]) / step)
+            self.log("speed/simulator_share", self._simulated / step)
+        self._began = now
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """A step whose gradient is not finite is skipped, and said so: one bad clip must not end a long run."""
+        gradients = [p.grad for p in self.trained() if p.grad is not None]
+        if gradients and not torch.stack([g.sum() for g in gradients]).isfinite().all():
+            optimizer.zero_grad()
+            self.skipped += 1
+            rank_zero_warn(f"step {self.global_step}: gradient not finite, step skipped ({self.skipped} so far)")
+        self.log("train/skipped", float(self.skipped))
 
     def report(self, stage: str, values: Mapping[str, Tensor], clips: int) -> None:
         """Log values under `stage/`; the progress bar shows the main ones."""
@@ -99,13 +133,13 @@ class SimulatedTask(L.LightningModule):
             )
 
     @abstractmethod
-    def step(self, batch: Scene, stage: str) -> Tensor:
+    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         """Loss of one batch; reports what it measures under `stage`, "train" or "val"."""
 
-    def training_step(self, batch: Scene, index: int) -> Tensor:
+    def training_step(self, batch: Scene | SimulatedScene, index: int) -> Tensor:
         return self.step(batch, "train")
 
-    def validation_step(self, batch: Scene, index: int) -> None:
+    def validation_step(self, batch: Scene | SimulatedScene, index: int) -> None:
         self.step(batch, "val")
 
     def configure_optimizers(self) -> Any:

@@ -1,0 +1,119 @@
+r"""The still scene, restored once for a whole clip.
+
+First a learned lucky fusion: K pictures, each a mean of the registered frames with weights of its own at every pixel,
+
+.. math::
+    F_k(x) = \sum_t w_{k,t}(x)\, I_t(x), \qquad w_{k,t} = \mathrm{softmax}_t\, (\ell_{k,t} + \log c_t)
+
+from logits l that the frames' features give and the confidence c of the registration. Then a U-Net on half, a quarter and
+an eighth of the resolution sharpens the first of them, knowing the others and what the reference gathered. However many
+frames a clip has, this part runs once: a deep network at a small cost a frame.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from turbnet.nets.blocks import ResidualBlock, conv3x3, each_frame, zero_start
+
+
+class LuckyFusion(nn.Module):
+    """K weighted means over time.
+
+    Args:
+        width: channels of the frames' features.
+        patch: features are at 1/patch of the resolution.
+        count: K.
+    """
+
+    def __init__(self, width: int, patch: int, count: int = 3) -> None:
+        super().__init__()
+        self.patch, self.count = patch, count
+        self.logits = conv3x3(width, count * patch**2)
+        zero_start(self.logits)
+
+    def forward(self, frames_BTCHW: Tensor, features_BTCHW: Tensor, confidence_BT1HW: Tensor) -> Tensor:
+        """(B, K C, H, W)."""
+        logits = F.pixel_shuffle(self.logits(features_BTCHW.flatten(0, 1)).float(), self.patch)
+        logits = logits.unflatten(0, features_BTCHW.shape[:2]) + confidence_BT1HW.float().clamp(min=1e-4).log()
+        weights = torch.softmax(logits, dim=1)
+        fused = [(weights[:, :, k : k + 1] * frames_BTCHW).sum(1) for k in range(self.count)]
+        return torch.cat(fused, dim=1).to(frames_BTCHW.dtype)
+
+
+class SceneNet(nn.Module):
+    """U-Net over half, a quarter and an eighth of the resolution; corrects the first of the pictures it is given.
+
+    Args:
+        inner: channels of the pictures.
+        known: channels of further features at a quarter of the resolution; 0: none.
+        widths: channels at the three scales.
+        depths: residual blocks at each scale, on the way down; on the way up as many but at the coarsest.
+        channels: of the picture corrected.
+    """
+
+    size_multiple = 8
+
+    def __init__(
+        self,
+        inner: int,
+        known: int = 0,
+        widths: Sequence[int] = (32, 64, 96),
+        depths: Sequence[int] = (1, 2, 4),
+        channels: int = 3,
+    ) -> None:
+        super().__init__()
+        self.channels = channels
+        self.embed = conv3x3(4 * inner, widths[0])
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:], strict=False))
+        self.know = nn.Conv2d(known, widths[1], 1) if known else None
+        self.encode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths, depths, strict=True))
+        self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in zip(widths, widths[1:], strict=False))
+        self.decode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths[:-1], depths, strict=False))
+        self.correct = conv3x3(widths[0], 4 * channels)
+        zero_start(self.correct)
+
+    def forward(self, pictures_BCHW: Tensor, known_BCHW: Tensor | None = None) -> Tensor:
+        """(B, channels, H, W); H and W multiples of `size_multiple`."""
+        x = self.embed(F.pixel_unshuffle(pictures_BCHW, 2))
+        passed = []
+        for scale, encode in enumerate(self.encode):
+            if scale:
+                passed.append(x)
+                x = self.down[scale - 1](x)
+            if scale == 1 and self.know is not None and known_BCHW is not None:
+                x = x + self.know(known_BCHW)
+            x = encode(x)
+        for scale in reversed(range(len(passed))):
+            x = self.decode[scale](passed[scale] + F.pixel_shuffle(self.up[scale](x), 2))
+        return pictures_BCHW[:, : self.channels] + F.pixel_shuffle(self.correct(x), 2)
+
+
+def _blocks(width: int, depth: int) -> nn.Sequential:
+    return nn.Sequential(*(ResidualBlock(width) for _ in range(depth)))
+
+
+class OwnFrame(nn.Module):
+    """A light correction of every frame, and where it counts instead of the still scene: where something moves.
+
+    Args:
+        width: channels of the frames' features.
+        patch: features are at 1/patch of the resolution.
+        channels: of the frames.
+    """
+
+    def __init__(self, width: int, patch: int, channels: int = 3) -> None:
+        super().__init__()
+        self.patch = patch
+        self.correct = conv3x3(width, channels * patch**2)
+        self.gate = conv3x3(width, patch**2)
+        zero_start(self.correct)
+        zero_start(self.gate, bias=-2.0)  # near the still scene
+
+    def forward(self, frames_BTCHW: Tensor, features_BTCHW: Tensor) -> tuple[Tensor, Tensor]:
+        """Corrected frames (B, T, C, H, W) and the gate (B, T, 1, H, W), 0: the still scene, 1: the frame."""
+        own = frames_BTCHW + each_frame(lambda f: F.pixel_shuffle(self.correct(f), self.patch), features_BTCHW)
+        gate = each_frame(lambda f: F.pixel_shuffle(self.gate(f), self.patch), features_BTCHW)
+        return own, torch.sigmoid(gate)
