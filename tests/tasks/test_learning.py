@@ -124,3 +124,24 @@ def test_out_of_range(more, says):
 def test_clips_that_the_network_cannot_take():
     with pytest.raises(InputError, match="width of the clips = 36 must be a multiple of 8"):
         TiltRemoval(net=NET, simulator={**SIMULATOR, "width": 36})
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_step_with_a_gradient_that_is_not_finite_is_skipped_and_said(batch, bad):
+    task, logged = make(Restoration), {}
+    task.log = logged.__setitem__
+    optimiser = torch.optim.AdamW(list(task.trained()), lr=1e-2)
+    task.training_step(batch, 0).backward()
+    before = {name: p.detach().clone() for name, p in task.net.named_parameters()}
+    next(iter(task.trained())).grad.view(-1)[0] = bad
+    with pytest.warns(UserWarning, match="step 0: gradient not finite, step skipped"):
+        task.on_before_optimizer_step(optimiser)
+    optimiser.step()
+    assert all(torch.equal(before[name], p) for name, p in task.net.named_parameters())
+    assert logged == {"train/skipped": 1.0}
+    # The next, sound step is taken.
+    task.training_step(batch, 0).backward()
+    task.on_before_optimizer_step(optimiser)
+    optimiser.step()
+    assert not all(torch.equal(before[name], p) for name, p in task.net.named_parameters())
+    assert logged == {"train/skipped": 1.0}

@@ -22,7 +22,9 @@ def dataset(
     clips: Annotated[
         Folders, typer.Option(metavar="FOLDER", help="Of clean videos and folders of frames; may be repeated.")
     ] = None,
-    simulator: Annotated[str, typer.Option(metavar="NAME", help="Of a group: path7km, recipe, wide or weak.")] = "path7km",
+    simulator: Annotated[
+        str, typer.Option(metavar="NAME", help="Of a group: path7km, recipe, wide or weak.")
+    ] = "path7km",
     samples: Annotated[int, typer.Option(help="How many.")] = 1000,
     frames: Annotated[int, typer.Option(help="Of a sample.")] = 8,
     size: Annotated[str, typer.Option(metavar="HEIGHTxWIDTH", help="Of a frame, pixels; one number: square.")] = "128",
