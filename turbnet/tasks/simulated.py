@@ -98,11 +98,11 @@ class SimulatedTask(L.LightningModule):
         return pair
 
     def on_train_batch_start(self, batch: Scene | SimulatedScene, index: int) -> None:
-        """Notes when the step began; what it waited for before that is the data's time."""
+        """The simulator's time is counted anew for each step."""
         self._simulated = 0.0
 
     def on_train_batch_end(self, outputs: Any, batch: Scene | SimulatedScene, index: int) -> None:
-        """Logs clips a second and the part of a step that was spent in the simulator (in this process) so far."""
+        """Logs clips a second and the simulator's part of the time since the last step ended, in this process."""
         now = time.perf_counter()
         if self._began:
             step = now - self._began
