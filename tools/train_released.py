@@ -1,19 +1,20 @@
 """Retrain the released weights: one command, resumable.
 
-    python tools/train_released.py s --pictures FOLDER [--output outputs/released] [--threads 2]
+    python tools/train_released.py s --pictures FOLDER [--leg 9] [--gpu] [--output outputs/released] [--threads 2]
 
-Trains `experiment=s` (or xs, m) on the pictures of a folder and rendered text, goes on from the last checkpoint if any,
-measures the result on pictures it has never seen, and writes turbnet/weights/s.onnx with its card.
+Trains `experiment=s` (or xs, m) on the pictures of folders or packs (tools/pack_pictures.py) and rendered text, goes on from
+the last checkpoint if any, measures the result on pictures it has never seen, and writes turbnet/weights/s.onnx with its
+card. With --leg it stops after so many minutes if it has not finished; the same command goes on.
 """
 
 import argparse
-import csv
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 
 from turbnet.data.clips import CleanClips
 from turbnet.data.pairs import PairMaker
@@ -30,7 +31,7 @@ CLIPS, FRAMES, SIZE, WINDOW = 8, 12, 128, 12
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("net", choices=("xs", "s", "m"), help="which network")
-    parser.add_argument("--pictures", required=True, help="folder of clean pictures to train on")
+    parser.add_argument("--pictures", required=True, nargs="+", type=Path, help="clean pictures: folders, packs")
     parser.add_argument(
         "--data", default="photographs of a user's folder, rendered text", help="what the card says of it"
     )
@@ -38,22 +39,34 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/released"))
     parser.add_argument("--weights", type=Path, default=Path(__file__).parents[1] / "turbnet" / "weights")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--leg", type=float, help="minutes to train at most this time")
+    parser.add_argument("--gpu", action="store_true", help="train on one GPU")
+    parser.add_argument(
+        "--set", dest="overrides", nargs="+", default=[], metavar="KEY=VALUE", help="of the configuration"
+    )
     options = parser.parse_args()
 
     output = options.output / options.net
     last = output / "checkpoints" / "last.ckpt"
     arguments = [
         f"experiment={options.net}",
-        f"data.folders=[{Path(options.pictures).resolve()}]",
+        f"data.folders=[{','.join(str(path.resolve()) for path in options.pictures)}]",
         f"threads={options.threads}",
         f"output={output}",
     ]
     if last.is_file():
         arguments.append(f"resume={last.resolve()}")
-    subprocess.run([sys.executable, "-m", "turbnet", "train", *arguments], check=True)
+    if options.gpu:
+        arguments.append("trainer=gpu")
+    if options.leg:
+        arguments.append(f"+trainer.max_time={{minutes: {options.leg}}}")
+    subprocess.run([sys.executable, "-m", "turbnet", "train", *arguments, *options.overrides], check=True)
+    done, steps, wanted = progress(output)
+    if done < wanted:
+        print(f"{done} of {wanted} epochs; the same command goes on")
+        return
 
     network, hyper_parameters = load_network(last)
-    steps = read_steps(output / "csv")
     hyper_parameters["recipe"] = {
         "data": options.data,
         "recipe": f"python tools/train_released.py {options.net} --pictures FOLDER",
@@ -74,13 +87,10 @@ def main() -> None:
     print(path.with_suffix(".md").read_text())
 
 
-def read_steps(curves: Path) -> int:
-    """Training steps taken, by the curves of all legs."""
-    steps = []
-    for curve in curves.glob("*/metrics.csv"):
-        with curve.open() as rows:
-            steps += [int(row["step"]) for row in csv.DictReader(rows)]
-    return 1 + max(steps)
+def progress(output: Path) -> tuple[int, int, int]:
+    """Epochs and steps behind the last checkpoint, and epochs of the whole recipe."""
+    last = torch.load(output / "checkpoints" / "last.ckpt", weights_only=True, map_location="cpu")
+    return last["epoch"] + 1, last["global_step"], OmegaConf.load(output / "config.yaml").trainer.max_epochs
 
 
 def quality(network: torch.nn.Module, source: Source, strength: float) -> str:

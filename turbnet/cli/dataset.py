@@ -1,12 +1,16 @@
 """`turbnet simulate --dataset`: turbulent clips with their truth, in shards, for training elsewhere."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from turbnet.cli.typed import run_typed
 from turbnet.errors import InputError
+
+if TYPE_CHECKING:
+    from turbnet.data.pack import PackedPicture
 
 Folders = list[Path] | None
 
@@ -127,9 +131,9 @@ def _write(options: dict[str, Any], folder: Path, workers: int | None, quiet: bo
         "sources": {},
     }
     if options["pictures"]:
-        paths = folder_paths(options["pictures"])
-        settings["sources"]["pictures"] = _fingerprint(paths)
-        source = Mixture([Pictures(paths), Text()], [1 - text, text])
+        pictures = folder_paths(options["pictures"])
+        settings["sources"]["pictures"] = _fingerprint(pictures)
+        source = Mixture([Pictures(pictures), Text()], [1 - text, text])
         sets.append(CleanClips(source, count, frames, height, width, options["moving"], seed))
     if options["clips"]:
         paths = footage_paths(options["clips"])
@@ -182,10 +186,14 @@ def _command(options: dict[str, Any]) -> str:
     return shlex.join([*words, *options["overrides"]])
 
 
-def _fingerprint(paths: list[Path]) -> dict[str, Any]:
+def _fingerprint(paths: "Sequence[Path | PackedPicture]") -> dict[str, Any]:
     """Number of files and a digest of their names and sizes, by which a resumed run knows its sources again."""
     import hashlib
 
-    files = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
-    listing = "".join(f"{file.name} {file.stat().st_size}\n" for file in files)
+    files = [
+        (part.name, part.stat().st_size) if isinstance(part, Path) else (f"{part.pack.name} {part.start}", part.size)
+        for path in paths
+        for part in (sorted(path.iterdir()) if isinstance(path, Path) and path.is_dir() else [path])
+    ]
+    listing = "".join(f"{name} {size}\n" for name, size in files)
     return {"files": len(files), "sha256_of_names_and_sizes": hashlib.sha256(listing.encode()).hexdigest()}

@@ -8,6 +8,7 @@ import lightning as L
 from torch.utils.data import DataLoader
 
 from turbnet.data.clips import CleanClips, EpochSampler, SimulatedClips
+from turbnet.data.pack import PackedPicture
 from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Mixture, Pictures, Source, Text, embedded_paths, folder_paths
 from turbnet.data.text_scenes import TextScenes
@@ -22,7 +23,8 @@ class ClipData(L.LightningDataModule):
         size: crops are size x size pixels.
         batch_size: clips of a step, in each process.
         steps_per_epoch: training steps of an epoch, which several processes share; every epoch brings fresh clips.
-        folders: of the user's pictures, searched recursively; empty: the pictures embedded in scikit-image.
+        folders: of the user's pictures, searched recursively, or packs of them (`turbnet.data.pack`); empty: the pictures
+            embedded in scikit-image.
         val_folders: the same for validation.
         text: fraction of clips with rendered text: half of them scenes of it, half filled with it.
         moving: fraction of clips with something that moves.
@@ -67,7 +69,7 @@ class ClipData(L.LightningDataModule):
         self.batch_size, self.workers = batch_size, workers
         ranges = (float(scales[0]), float(scales[1]))
 
-        def source(paths: list[Path]) -> Source:
+        def source(paths: Sequence[Path | PackedPicture]) -> Source:
             return Mixture([Pictures(paths, ranges), TextScenes(), Text()], [1 - text, text / 2, text / 2])
 
         train = source(folder_paths(folders) if folders else embedded_paths("train"))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from turbnet.data.pack import SUFFIX, PackedPicture, packed_pictures
 from turbnet.data.text import render_text
 from turbnet.errors import InputError
 from turbnet.media.clip import open_clip
@@ -49,12 +50,14 @@ class Source(Protocol):
 
 
 @lru_cache(maxsize=16)  # all embedded pictures; of a large folder, few enough for a small machine
-def load_picture(path: Path) -> Picture:
-    """An image file as (H, W, 3) float32 in [0, 1]; of several frames the first.
+def load_picture(path: Path | PackedPicture) -> Picture:
+    """A picture in a file or a pack as (H, W, 3) float32 in [0, 1]; of several frames the first.
 
     Raises:
         InputError: it is no picture.
     """
+    if isinstance(path, PackedPicture):
+        return path.load()
     with open_clip(path) as clip:
         return next(iter(clip))
 
@@ -66,14 +69,17 @@ def embedded_paths(split: str) -> list[Path]:
     return [Path(skimage.data.__file__).parent / name for name in EMBEDDED[split]]
 
 
-def folder_paths(folders: Sequence[str | Path]) -> list[Path]:
-    """Every picture below the folders, sorted.
+def folder_paths(folders: Sequence[str | Path]) -> list[Path | PackedPicture]:
+    """Every picture below the folders, sorted; of a pack (`turbnet.data.pack`), every picture in it.
 
     Raises:
-        InputError: a folder does not exist or holds no picture.
+        InputError: a folder or a pack does not exist or holds no picture.
     """
-    paths: list[Path] = []
+    paths: list[Path | PackedPicture] = []
     for folder in map(Path, folders):
+        if folder.suffix == SUFFIX and not folder.is_dir():
+            paths += packed_pictures(folder)
+            continue
         found = sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES)
         if not found:
             raise InputError(f"no pictures in {folder}" if folder.is_dir() else f"there is no folder {folder}")
@@ -85,12 +91,12 @@ class Pictures:
     """Random crops of pictures, turned, mirrored and reduced at random.
 
     Args:
-        paths: image files.
+        paths: image files, or pictures of a pack.
         scales: range of the factor by which a picture is reduced before cropping, at most 1. Reduction hides compression
             artefacts. A picture smaller than the crop is enlarged.
     """
 
-    def __init__(self, paths: Sequence[Path], scales: tuple[float, float] = (0.5, 1.0)) -> None:
+    def __init__(self, paths: Sequence[Path | PackedPicture], scales: tuple[float, float] = (0.5, 1.0)) -> None:
         self.paths, self.scales = list(paths), scales
 
     def __call__(self, rng: np.random.Generator, height: int, width: int) -> Picture:
