@@ -8,7 +8,7 @@ from turbnet.nets.tcja import JointAttention, TCJATransformer, _unit
 
 def features(net: TCJATransformer, clip: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Of a clip and its mean, with the same confidence everywhere."""
-    return net(clip.mean(1, keepdim=True), clip, torch.full_like(clip[:, :, :1], 0.5))
+    return net(clip.mean(1, keepdim=True), clip, torch.full_like(clip[:, :, :1], 0.5))[:2]
 
 
 def made(**more) -> TCJATransformer:
@@ -81,7 +81,7 @@ class TestJointAttention:
         net, clip = JointAttention(6, groups=2), torch.rand(1, 3, 6, 4, 5)
         net.log_temperature.copy_(torch.tensor([[0.5], [1.5]]))
         expected, _ = self.by_definition(net, clip[0])
-        torch.testing.assert_close(net(clip)[0], expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(net(clip)[0][0], expected, rtol=0, atol=1e-5)
 
     @torch.no_grad()
     def test_the_weights_of_a_token_sum_to_one(self):
@@ -92,7 +92,7 @@ class TestJointAttention:
         net.expand.bias[12:] = 2.0
         net.project.weight.copy_(torch.eye(6)[:, :, None, None])
         net.project.bias.zero_()
-        torch.testing.assert_close(net(clip), torch.full_like(clip, 2.0))
+        torch.testing.assert_close(net(clip)[0], torch.full_like(clip, 2.0))
 
     @pytest.mark.parametrize("scale", [0.0, 1e-6, 1.0, 1e6])
     @pytest.mark.parametrize("temperature", [1.5, 100.0])
@@ -103,7 +103,7 @@ class TestJointAttention:
             net.log_temperature.fill_(temperature)  # exp(100) is infinite: held to its bound
             net.expand.bias.zero_()
         x = (scale * torch.randn(1, 3, 8, 4, 4)).requires_grad_()
-        out = net(x)
+        out, _ = net(x)
         out.square().mean().backward()
         assert torch.isfinite(out).all()
         assert torch.isfinite(x.grad).all()

@@ -4,11 +4,29 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from turbnet.nets.scene import LuckyFusion, OwnFrame, SceneNet
 from turbnet.nets.tcja import TCJATransformer
 from turbnet.nets.tilt import Registered, TiltNet
+
+_NO_WEIGHT = -50.0  # logarithm of a weight that counts for nothing
+
+
+class Past(NamedTuple):
+    """What a restorer carries from frame to frame; zero everywhere: nothing has been seen.
+
+    Attributes:
+        reference: of the registration, and the sum of confidence behind it, (B, C + 1, H, W).
+        memory: of the TCJA transformer, (B, M, `TCJATransformer.memory_channels`, H/p, W/p), M frames.
+        pictures: of the lucky fusion, and the logarithm of the weight behind each, counted from a weight of nothing,
+            (B, K, C + 1, H, W).
+    """
+
+    reference: Tensor
+    memory: Tensor
+    pictures: Tensor
 
 
 class Restored(NamedTuple):
@@ -19,12 +37,14 @@ class Restored(NamedTuple):
         scene: the still scene (B, 1, C, H, W).
         gate: where a frame is not the still scene, (B, T, 1, H, W), 0 to 1.
         registered: what tilt removal made of the clip.
+        seen: what there is to carry on of these frames and those before.
     """
 
     frames: Tensor
     scene: Tensor
     gate: Tensor
     registered: Registered
+    seen: Past
 
 
 class Restorer(nn.Module):
@@ -53,15 +73,30 @@ class Restorer(nn.Module):
         self.own = OwnFrame(width, patch)
         self.size_multiple = math.lcm(self.tilt.size_multiple, patch, self.scene.size_multiple)
 
-    def stages(self, frames_BTCHW: Tensor) -> Restored:
-        """Restored frames and what led to them."""
-        registered = self.tilt(frames_BTCHW)
+    def stages(self, frames_BTCHW: Tensor, past: Past | None = None) -> Restored:
+        """Restored frames and what led to them.
+
+        Args:
+            past: what earlier frames left behind; they take part in registration, attention and fusion.
+        """
+        registered = self.tilt(frames_BTCHW, past and past.reference)
         confidence = registered.confidence
-        gathered, features = self.tcja(registered.reference, registered.frames, confidence)
-        fused = self.fusion(registered.frames, features, confidence)
-        scene = self.scene(fused, gathered)[:, None]
+        gathered, features, memory = self.tcja(
+            registered.reference, registered.frames, confidence, past and past.memory
+        )
+        earlier = None
+        if past is not None:
+            earlier = torch.cat((past.pictures[:, :, :-1], past.pictures[:, :, -1:] + _NO_WEIGHT), dim=2)
+        pictures, weight = self.fusion(registered.frames, features, confidence, earlier)
+        scene = self.scene(pictures.flatten(1, 2), gathered)[:, None]
         own, gate = self.own(registered.frames, features)
-        return Restored(scene + gate * (own - scene), scene, gate, registered)
+        total = confidence.sum(1) if past is None else confidence.sum(1) + past.reference[:, -1:]
+        seen = Past(
+            torch.cat((registered.reference[:, 0], total), dim=1),
+            memory,
+            torch.cat((pictures, (weight - _NO_WEIGHT).clamp(min=0)), dim=2),
+        )
+        return Restored(scene + gate * (own - scene), scene, gate, registered, seen)
 
     def forward(self, frames_BTCHW: Tensor) -> Tensor:
         """Restored frames (B, T, C, H, W), sRGB-encoded in [0, 1] like the input; H and W multiples of `size_multiple`."""

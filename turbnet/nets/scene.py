@@ -34,13 +34,29 @@ class LuckyFusion(nn.Module):
         self.logits = conv3x3(width, count * patch**2)
         zero_start(self.logits)
 
-    def forward(self, frames_BTCHW: Tensor, features_BTCHW: Tensor, confidence_BT1HW: Tensor) -> Tensor:
-        """(B, K C, H, W)."""
+    def forward(
+        self,
+        frames_BTCHW: Tensor,
+        features_BTCHW: Tensor,
+        confidence_BT1HW: Tensor,
+        past_BKCHW: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The pictures (B, K, C, H, W) and the logarithm of the weight behind each, (B, K, 1, H, W).
+
+        Args:
+            past_BKCHW: both for earlier frames, (B, K, C + 1, H, W): they count as one more frame of that weight.
+        """
         logits = F.pixel_shuffle(self.logits(features_BTCHW.flatten(0, 1)).float(), self.patch)
         logits = logits.unflatten(0, features_BTCHW.shape[:2]) + confidence_BT1HW.float().clamp(min=1e-4).log()
+        if past_BKCHW is not None:
+            logits = torch.cat((past_BKCHW[:, None, :, -1], logits), dim=1)
         weights = torch.softmax(logits, dim=1)
-        fused = [(weights[:, :, k : k + 1] * frames_BTCHW).sum(1) for k in range(self.count)]
-        return torch.cat(fused, dim=1).to(frames_BTCHW.dtype)
+        now = weights[:, -frames_BTCHW.shape[1] :]
+        fused = [(now[:, :, k : k + 1] * frames_BTCHW).sum(1) for k in range(self.count)]
+        pictures = torch.stack(fused, dim=1)
+        if past_BKCHW is not None:
+            pictures = pictures + weights[:, 0, :, None] * past_BKCHW[:, :, :-1]
+        return pictures.to(frames_BTCHW.dtype), torch.logsumexp(logits, dim=1)[:, :, None]
 
 
 class SceneNet(nn.Module):

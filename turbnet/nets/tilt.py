@@ -9,7 +9,8 @@ correction. It also says how sure it is, as the scale b of a Laplace distributio
     p(t) \propto \frac{1}{b} e^{-|t - \hat t| / b}, \qquad b = b_0 e^{-z}, \qquad c = \frac{1}{1 + b / b_0} = \sigma(z)
 
 The reference is the mean of the frames as registered so far, each weighted by its confidence c: what passes through the
-scene weighs little in it, and it sharpens from level to level. Nothing depends on the number of frames.
+scene weighs little in it, and it sharpens from level to level. Nothing depends on the number of frames, and a reference
+made of earlier frames can take part in it.
 
 After the tilt-removal stage of TMT (Zhang et al., IEEE TCI 2024), which supervises three scales with blur-only frames;
 here the reference is explicit, the first guess is computed and not learned, and the frame count is free.
@@ -102,7 +103,12 @@ class TiltNet(nn.Module):
         super().__init__()
         self.levels = nn.ModuleList(_Level(channels, width) for width in widths)
 
-    def forward(self, frames_BTCHW: Tensor) -> Registered:
+    def forward(self, frames_BTCHW: Tensor, past_BCHW: Tensor | None = None) -> Registered:
+        """The frames registered to each other and to what came before.
+
+        Args:
+            past_BCHW: the reference of earlier frames and the sum of their confidence, (B, C + 1, H, W).
+        """
         batch, count, _, height, width = frames_BTCHW.shape
         frames = frames_BTCHW.flatten(0, 1)
         coarse = (height // SCALES[0], width // SCALES[0])
@@ -114,7 +120,11 @@ class TiltNet(nn.Module):
             if tilts:
                 tilt, logit = _enlarged(tilt, 2), _enlarged(logit, 2)
             registered = warp(small, tilt / scale)
-            reference = weighted_mean(registered.unflatten(0, (batch, count)), logit.unflatten(0, (batch, count)))
+            reference = weighted_mean(
+                registered.unflatten(0, (batch, count)),
+                logit.unflatten(0, (batch, count)),
+                None if past_BCHW is None else F.avg_pool2d(past_BCHW, scale),
+            )
             everywhere = reference.expand(batch, count, *reference.shape[2:]).flatten(0, 1)
             # Levels work in their own pixels, where a tilt is of order one.
             moved, logit = level(registered, everywhere, tilt / scale, logit)
@@ -123,15 +133,19 @@ class TiltNet(nn.Module):
             tilts.append(tilt)
             logits.append(logit)
         out = warp(frames, _enlarged(tilt, SCALES[-1])).unflatten(0, (batch, count))
-        reference = weighted_mean(out, _enlarged(logit, SCALES[-1]).unflatten(0, (batch, count)))
+        reference = weighted_mean(out, _enlarged(logit, SCALES[-1]).unflatten(0, (batch, count)), past_BCHW)
         tilts, logits = ([x.unflatten(0, (batch, count)) for x in xs] for xs in (tilts, logits))
         return Registered(out, tilts, logits, reference)
 
 
-def weighted_mean(frames_BTCHW: Tensor, logits_BT1HW: Tensor) -> Tensor:
-    """Mean over time by confidence, (B, 1, C, H, W)."""
+def weighted_mean(frames_BTCHW: Tensor, logits_BT1HW: Tensor, past_BCHW: Tensor | None = None) -> Tensor:
+    """Mean over time by confidence, (B, 1, C, H, W); of a past (a mean and its weight, (B, C + 1, H, W)) as well."""
     weights = torch.sigmoid(logits_BT1HW.float())
-    return ((frames_BTCHW * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True)).to(frames_BTCHW.dtype)
+    total, weight = (frames_BTCHW * weights).sum(1, keepdim=True), weights.sum(1, keepdim=True)
+    if past_BCHW is not None:
+        mean, earlier = past_BCHW[:, None, :-1], past_BCHW[:, None, -1:]
+        total, weight = total + earlier * mean, weight + earlier
+    return (total / weight).to(frames_BTCHW.dtype)
 
 
 def _enlarged(x_NCHW: Tensor, factor: int) -> Tensor:
