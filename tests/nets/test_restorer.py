@@ -61,7 +61,7 @@ def test_bfloat16_autocast_is_finite_and_near_float32(scale):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"name": "unet"}, "there is no network named 'unet'"),
+        ({"name": "vnet"}, "there is no network named 'vnet'"),
         ({"name": None}, "there is no network named None"),
         ({"depth": 3}, "depth"),
         ({"tcja": {"wide": 3}}, "wide"),

@@ -52,6 +52,30 @@ def test_checkpoint_to_model(checkpoint, tmp_path, capsys):
         np.testing.assert_allclose(model(frames_BTCHW.numpy()), network(frames_BTCHW).numpy(), atol=2e-5)
 
 
+def test_a_range_of_frames_gives_its_greatest_and_streaming_goes_frame_by_frame(checkpoint, tmp_path):
+    hyper_parameters = checkpoint["hyper_parameters"]
+    recipe = {**hyper_parameters["recipe"], "frames": [1, 14]}
+    changed = {**checkpoint, "hyper_parameters": {**hyper_parameters, "recipe": recipe}}
+    torch.save(changed, tmp_path / "last.ckpt")
+    assert run(["export", str(tmp_path / "last.ckpt"), "--quiet"]) == 0
+    assert Model.load(tmp_path / "last.onnx").card.frames == 14
+    stream = tmp_path / "stream.onnx"
+    options = ["--streaming", "--horizon", "9", "--remember", "2", "--quiet"]
+    assert run(["export", str(tmp_path / "last.ckpt"), "-o", str(stream), *options]) == 0
+    model = Model.load(stream)
+    assert model.card.carried["memory"]["shape"][0] == 2
+    assert model.card.notes["frame by frame"] == "horizon 9 frames, keys and values of 2"
+    frames_BTCHW = np.random.default_rng(0).random((1, 3, 3, 32, 32), np.float32)
+    first = Model.load(tmp_path / "last.onnx")(frames_BTCHW[:, :1])
+    np.testing.assert_allclose(model(frames_BTCHW)[:, :1], first, atol=2e-5)  # nothing seen before
+
+
+def test_streaming_options_out_of_range(checkpoint, tmp_path, capsys):
+    torch.save(checkpoint, tmp_path / "last.ckpt")
+    says = refused(capsys, tmp_path, str(tmp_path / "last.ckpt"), "--streaming", "--horizon", "0.5")
+    assert "horizon = 0.5" in says
+
+
 def refused(capsys, tmp_path, *arguments: str) -> str:
     before = set(tmp_path.iterdir())
     assert run(["export", *arguments]) == 2

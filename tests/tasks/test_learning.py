@@ -61,6 +61,16 @@ def test_restoration_learns_one_clip_by_heart(batch):
     assert losses[-1] - floor < 0.5 * (losses[0] - floor)
 
 
+def test_a_plain_unet_learns_one_clip_by_heart(batch):
+    net = {"name": "unet", "widths": [8, 12, 16], "depths": [1, 1, 1]}
+    task = Restoration(net=net, simulator={**SIMULATOR, "d_over_r0": [3.0, 3.0]})
+    task.report = lambda *values: None
+    losses = learn(task, batch, 100, 2e-3)
+    assert losses[-1] < 0.6 * losses[0]
+    with pytest.raises(InputError, match="trains a Restorer; the network 'unet' is none"):
+        TiltRemoval(net=net, simulator=SIMULATOR)
+
+
 @pytest.mark.parametrize("kind", [TiltRemoval, Restoration])
 @pytest.mark.parametrize("strength", [0.0, 10.0])
 def test_gradients_are_finite(kind, strength, batch):

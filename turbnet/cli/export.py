@@ -20,11 +20,17 @@ def export(
         int | None,
         typer.Option(help="frames to restore together, as recommended to users; default: as in training, or 12"),
     ] = None,
+    streaming: Annotated[
+        bool, typer.Option("--streaming", help="frame by frame, carrying what was seen along, in place of windows")
+    ] = False,
+    horizon: Annotated[float, typer.Option(help="with --streaming: frames after which what was seen has faded")] = 50.0,
+    remember: Annotated[int, typer.Option(help="with --streaming: frames whose keys and values are kept")] = 6,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no summary")] = False,
 ) -> int:
     """Write the network of a checkpoint as an ONNX file with its model card, proven against torch."""
     from turbnet.deploy.checkpoint import card_of, load_network
+    from turbnet.deploy.checkpoint import streaming as go_frame_by_frame
     from turbnet.deploy.export import TOLERANCE, export_onnx
     from turbnet.deploy.session import Model
     from turbnet.errors import InputError, check_range
@@ -35,8 +41,11 @@ def export(
         raise InputError(f"cannot write {path}: the name of a model ends in .onnx")
     network, hyper_parameters = load_network(checkpoint)
     if frames is None:
-        frames = (hyper_parameters.get("recipe") or {}).get("frames", 12)
+        trained = (hyper_parameters.get("recipe") or {}).get("frames", 12)
+        frames = trained if isinstance(trained, int) else trained[-1]  # of a range the most
     card = card_of(network, hyper_parameters, int(check_range("frames", frames, 1, 1000)))
+    if streaming:
+        network, card = go_frame_by_frame(network, card, horizon, remember)
     report = Report()
     for row in export_onnx(network, card, path):
         shape = "x".join(str(size) for size in row.shape)

@@ -2,7 +2,7 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +13,7 @@ from turbnet.errors import InputError
 from turbnet.media.atomic import atomic_path
 
 PREFIX = "turbnet."
+_LATER = ("carried",)  # fields that older files lack
 
 
 class Card(ABC):
@@ -44,7 +45,11 @@ class Card(ABC):
             InputError: a field is missing or is not what this version of turbnet writes.
         """
         try:
-            values = {item.name: metadata[PREFIX + item.name] for item in fields(cls)}  # type: ignore[arg-type]
+            values = {
+                item.name: metadata[PREFIX + item.name]
+                for item in fields(cls)  # type: ignore[arg-type]
+                if item.name not in _LATER or PREFIX + item.name in metadata
+            }
             sha256 = values.pop("sha256")
             return cls(**{name: json.loads(value) for name, value in values.items()} | {"sha256": sha256})
         except (KeyError, ValueError, TypeError) as error:
@@ -94,6 +99,9 @@ class ModelCard(Card):
         notes: data, training time, measured quality and whatever else a reader should know; plain values.
         version: of the turbnet that wrote the file.
         sha256: digest of the file, see `turbnet.deploy.seal`; zeros until there is a file.
+        carried: further inputs and outputs of a network that goes frame by frame, by name: `shape` between batch and height,
+            and `scale`, the fraction of the height and width it has; zero before the first frame. Empty: the network takes
+            whole windows.
     """
 
     architecture: str
@@ -106,6 +114,7 @@ class ModelCard(Card):
     notes: dict[str, Any] = field(default_factory=dict)
     version: str = __version__
     sha256: str = UNSEALED
+    carried: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         low, high = self.data_range
@@ -118,7 +127,13 @@ class ModelCard(Card):
             ("values", "{:g} to {:g}".format(*self.data_range)),
             ("height and width", f"multiples of {self.size_multiple}"),
             ("frames at a time", f"{self.frames} recommended, any number accepted"),
+            *((f"carried {name}", _carried(**spec)) for name, spec in self.carried.items()),
         ]
+
+
+def _carried(shape: Sequence[int], scale: int) -> str:
+    sides = ("height", "width") if scale == 1 else (f"height / {scale}", f"width / {scale}")
+    return f"(batch, {', '.join(map(str, shape))}, {', '.join(sides)}), zero at first, returned with `next_` before its name"
 
 
 @dataclass(frozen=True)

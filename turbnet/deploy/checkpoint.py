@@ -1,5 +1,6 @@
 """From a checkpoint of `turbnet train` to a network and its card."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ from torch import nn
 from turbnet.deploy.card import ModelCard
 from turbnet.errors import InputError
 from turbnet.nets import build
+from turbnet.nets.restorer import Restorer
+from turbnet.nets.streaming import StreamingRestorer
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
 
 
@@ -45,6 +48,30 @@ def card_of(network: nn.Module, hyper_parameters: dict[str, Any], frames: int) -
         seed=hyper_parameters.get("seed"),
         notes=_without_folders(notes),
     )
+
+
+def streaming(
+    network: nn.Module, card: ModelCard, horizon: float, remember: int
+) -> tuple[StreamingRestorer, ModelCard]:
+    """The same network frame by frame, and its card.
+
+    Args:
+        horizon, remember: of `StreamingRestorer`.
+
+    Raises:
+        InputError: the network is no restorer, a value out of range.
+    """
+    if not isinstance(network, Restorer):
+        raise InputError(f"only a restorer goes frame by frame; {card.architecture} is none")
+    wrapped = StreamingRestorer(network, horizon, remember)
+    patch = network.tcja.patch
+    shapes = wrapped.nothing(1, card.size_multiple, card.size_multiple)
+    carried = {
+        name: {"shape": list(part.shape[1:-2]), "scale": patch if name == "memory" else 1}
+        for name, part in shapes._asdict().items()
+    }
+    notes = {"frame by frame": f"horizon {horizon:g} frames, keys and values of {remember}", **card.notes}
+    return wrapped, replace(card, frames=1, notes=notes, carried=carried)
 
 
 def _without_folders(value: Any) -> Any:

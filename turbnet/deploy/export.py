@@ -22,7 +22,7 @@ from torch import nn
 
 from turbnet.deploy.card import Card, ModelCard
 from turbnet.deploy.seal import seal
-from turbnet.deploy.session import INPUT, OUTPUT, Model
+from turbnet.deploy.session import INPUT, NEXT, OUTPUT, Model
 from turbnet.errors import InputError
 from turbnet.media.atomic import atomic_path
 
@@ -42,7 +42,8 @@ def export_onnx(module: nn.Module, card: ModelCard, path: str | Path) -> list[Pa
 
     Args:
         module: (B, T, C, H, W) -> (B, T, C', H, W) float32, for any B, T >= 1 and H, W multiples of
-            `card.size_multiple`. A part of a network (its tilt removal alone, say) qualifies as well.
+            `card.size_multiple`. A part of a network (its tilt removal alone, say) qualifies as well. Where the card names
+            what is carried, module takes it too, in that order, and returns (frames, *carried).
         card: its digest is filled in on the way.
 
     Raises:
@@ -51,7 +52,7 @@ def export_onnx(module: nn.Module, card: ModelCard, path: str | Path) -> list[Pa
     """
     with atomic_path(path) as temporary:
         module = flush_denormals(copy.deepcopy(module).cpu().float().eval())
-        data = sealed(_name_sizes(_to_onnx(module, card)), card)
+        data = sealed(_name_sizes(_to_onnx(module, card), card), card)
         try:
             parity = compare(module, Model(data))
         except InputError as error:
@@ -93,12 +94,31 @@ def compare(module: nn.Module, model: Model) -> list[Parity]:
     ]:
         shape = (batch, frames, channels, height, width)
         frames_BTCHW = torch.rand(shape, generator=generator)
-        with torch.no_grad():
-            expected = module(frames_BTCHW).numpy()
+        expected = _whole(module, frames_BTCHW, card=model.card).numpy()
         restored = model(frames_BTCHW.numpy())
         same_shape = restored.shape == expected.shape
         rows.append(Parity(shape, float(np.abs(restored - expected).max()) if same_shape else float("inf")))
     return rows
+
+
+@torch.no_grad()
+def _whole(module: nn.Module, frames_BTCHW: torch.Tensor, card: ModelCard) -> torch.Tensor:
+    """The frames of a clip through `module`, one after the other if it carries something."""
+    if not card.carried:
+        return module(frames_BTCHW)
+    batch, _, _, height, width = frames_BTCHW.shape
+    carried, restored = _nothing(card, batch, height, width), []
+    for frame in frames_BTCHW.split(1, dim=1):
+        out, *carried = module(frame, *carried)
+        restored.append(out)
+    return torch.cat(restored, dim=1)
+
+
+def _nothing(card: ModelCard, batch: int, height: int, width: int) -> list[torch.Tensor]:
+    return [
+        torch.zeros(batch, *spec["shape"], height // spec["scale"], width // spec["scale"])
+        for spec in card.carried.values()
+    ]
 
 
 def flush_denormals(module: nn.Module) -> nn.Module:
@@ -113,16 +133,19 @@ def flush_denormals(module: nn.Module) -> nn.Module:
 def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
     # Sizes of one would be baked in, equal sizes might be taken for one another.
     shape = (2, max(card.frames, 3), card.channels, 6 * card.size_multiple, 8 * card.size_multiple)
+    clip = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    carried = _nothing(card, shape[0], *shape[3:])
     free = {axis: torch.export.Dim.DYNAMIC for axis in (0, 1, 3, 4)}
+    sides = [{axis: torch.export.Dim.DYNAMIC for axis in (0, x.ndim - 2, x.ndim - 1)} for x in carried]
     try:
         with quiet_exporter():
             program = torch.onnx.export(
                 module,
-                (torch.rand(shape, generator=torch.Generator().manual_seed(0)),),
+                (clip, *carried),
                 dynamo=True,
-                input_names=[INPUT],
-                output_names=[OUTPUT],
-                dynamic_shapes=(free,),
+                input_names=[INPUT, *card.carried],
+                output_names=[OUTPUT, *(NEXT + name for name in card.carried)],
+                dynamic_shapes=(free, *sides),
                 external_data=False,
                 verbose=False,
             )
@@ -158,11 +181,17 @@ def _strip(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def _name_sizes(model: onnx.ModelProto) -> onnx.ModelProto:
+def _name_sizes(model: onnx.ModelProto, card: ModelCard) -> onnx.ModelProto:
     """Name the free sizes."""
     for value in (*model.graph.input, *model.graph.output):
-        for axis, name in ((0, "batch"), (1, "frames"), (3, "height"), (4, "width")):
-            value.type.tensor_type.shape.dim[axis].dim_param = name
+        size = value.type.tensor_type.shape.dim
+        size[0].dim_param = "batch"
+        spec = card.carried.get(value.name.removeprefix(NEXT))
+        scale = 1 if spec is None else spec["scale"]
+        for axis, name in ((-2, "height"), (-1, "width")):
+            size[axis].dim_param = name if scale == 1 else f"{name}/{scale}"
+        if spec is None:
+            size[1].dim_param = "frames"
     return model
 
 

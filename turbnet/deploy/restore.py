@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from turbnet.deploy.method import ClassicalMethod
-from turbnet.deploy.session import Model
+from turbnet.deploy.session import Carried, Model
 from turbnet.deploy.stream import stream, window_count
 from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError, check_range
@@ -78,6 +78,28 @@ def restore_frames(
         yield np.moveaxis(restored_CHW, 0, -1).clip(0, 1)
 
 
+class FrameByFrame:
+    """A network that carries something along, given the tiles of one frame after the other, always in the same order.
+
+    Args:
+        model: whose card names what is carried.
+        tiles: of a frame.
+    """
+
+    def __init__(self, model: Model, tiles: int) -> None:
+        self._model = model
+        self._carried: list[Carried] = [{}] * tiles
+        self._turn = 0
+
+    def __call__(self, frames_BTCHW: np.ndarray) -> np.ndarray:
+        """The next tile's frames restored, (1, T, C, h, w)."""
+        batch, _, _, height, width = frames_BTCHW.shape
+        carried = self._carried[self._turn] or self._model.nothing(batch, height, width)
+        restored_BTCHW, self._carried[self._turn] = self._model.step(frames_BTCHW, carried)
+        self._turn = (self._turn + 1) % len(self._carried)
+        return restored_BTCHW
+
+
 def window_overlap(window: int) -> int:
     """Frames that successive windows share."""
     return window // 4
@@ -107,6 +129,8 @@ def restore_clip(
         InputError: the source cannot be read, the destination cannot be written, a parameter is out of range.
     """
     tiling = Tiling(tile, min(OVERLAP, tile // 4) if overlap is None else overlap, model.card.size_multiple)
+    if model.card.carried and window not in (None, 1):
+        raise InputError(f"window = {window}: the model goes frame by frame")
     window = int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
     count, inside, start = 0, 0.0, time.perf_counter()
     with (
@@ -118,14 +142,15 @@ def restore_clip(
         tiles = tiling.count(info.height, info.width)
         windows = window_count(info.frames, window, window_overlap(window)) if info.frames else None
         task = progress.add_task("restoring", total=windows and windows * tiles)
+        whole = FrameByFrame(model, tiles) if isinstance(model, Model) and model.card.carried else model
 
         def network(frames_BTCHW: np.ndarray) -> np.ndarray:
             nonlocal inside
             began = time.perf_counter()
-            if isinstance(model, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
-                restored_BTCHW = model(frames_BTCHW, lambda share: progress.advance(task, share))
+            if isinstance(whole, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
+                restored_BTCHW = whole(frames_BTCHW, lambda share: progress.advance(task, share))
             else:
-                restored_BTCHW = model(frames_BTCHW)
+                restored_BTCHW = whole(frames_BTCHW)
                 progress.advance(task)
             inside += time.perf_counter() - began
             return restored_BTCHW

@@ -11,6 +11,11 @@ from turbnet.deploy.seal import verify
 from turbnet.errors import InputError, check_range
 
 INPUT, OUTPUT = "frames", "restored"
+NEXT = "next_"
+"""Before the name of what is carried on to the next frame, as an output."""
+
+Carried = dict[str, np.ndarray]
+"""What a network that goes frame by frame takes along, by name."""
 
 
 class Model:
@@ -53,24 +58,56 @@ class Model:
             raise InputError(f"{path}: {error}") from error
 
     def __call__(self, frames_BTCHW: np.ndarray) -> np.ndarray:
-        """Restore all frames at once: float32 (batch, frames, channels, height, width) in, the same shape out.
+        """Restore all frames: float32 (batch, frames, channels, height, width) in, the same shape out.
+
+        At once, or one after the other where the network carries something from frame to frame.
 
         Raises:
             InputError: the shape is not what the card asks for, or memory does not suffice.
         """
-        card, shape = self.card, frames_BTCHW.shape
+        if not self.card.carried:
+            return self._run(frames_BTCHW, {})[0]
+        self._check(frames_BTCHW.shape)
+        batch, count, _, height, width = frames_BTCHW.shape
+        carried, restored = self.nothing(batch, height, width), []
+        for time in range(count):
+            frame_BTCHW, carried = self.step(frames_BTCHW[:, time : time + 1], carried)
+            restored.append(frame_BTCHW)
+        return np.concatenate(restored, axis=1)
+
+    def step(self, frames_BTCHW: np.ndarray, carried: Carried) -> tuple[np.ndarray, Carried]:
+        """Restore the next frames of a clip, given what was carried on from those before; as `__call__`."""
+        restored_BTCHW, *following = self._run(frames_BTCHW, carried)
+        return restored_BTCHW, dict(zip(self.card.carried, following, strict=True))
+
+    def nothing(self, batch: int, height: int, width: int) -> Carried:
+        """What is carried before the first frame."""
+        return {
+            name: np.zeros((batch, *spec["shape"], height // spec["scale"], width // spec["scale"]), np.float32)
+            for name, spec in self.card.carried.items()
+        }
+
+    def _run(self, frames_BTCHW: np.ndarray, carried: Carried) -> list[np.ndarray]:
+        self._check(frames_BTCHW.shape)
+        outputs = [OUTPUT, *(NEXT + name for name in carried)]
+        try:
+            results: list[np.ndarray] = self._session.run(
+                outputs, {INPUT: np.ascontiguousarray(frames_BTCHW, np.float32), **carried}
+            )
+        except Exception as error:  # as above
+            raise InputError(
+                f"onnxruntime failed on frames of shape {frames_BTCHW.shape} ({error}); "
+                "take smaller tiles or a shorter window"
+            ) from error
+        return results
+
+    def _check(self, shape: tuple[int, ...]) -> None:
+        card = self.card
         if len(shape) != 5 or shape[2] != card.channels or any(side % card.size_multiple for side in shape[3:]):
             raise InputError(
                 f"frames of shape {shape}: the network takes (batch, frames, {card.channels}, height, width), "
                 f"height and width multiples of {card.size_multiple}"
             )
-        try:
-            (restored_BTCHW,) = self._session.run([OUTPUT], {INPUT: np.ascontiguousarray(frames_BTCHW, np.float32)})
-        except Exception as error:  # as above
-            raise InputError(
-                f"onnxruntime failed on frames of shape {shape} ({error}); take smaller tiles or a shorter window"
-            ) from error
-        return restored_BTCHW
 
 
 def available_cores() -> int:

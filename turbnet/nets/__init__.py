@@ -7,8 +7,9 @@ from torch import nn
 
 from turbnet.errors import InputError
 from turbnet.nets.restorer import Restorer
+from turbnet.nets.unet import UNet
 
-NETS: dict[str, type[nn.Module]] = {"restorer": Restorer}
+NETS: dict[str, type[nn.Module]] = {"restorer": Restorer, "unet": UNet}
 """Every network that a config or a checkpoint can name."""
 
 

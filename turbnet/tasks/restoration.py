@@ -6,13 +6,15 @@ from typing import Any
 from torch import Tensor, nn
 
 from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.nets.restorer import Restorer
+from turbnet.nets.unet import UNet
 from turbnet.tasks.checkpoint import load_net
 from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, registration_loss, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
 
 
 class Restoration(SimulatedTask):
-    """Trains a restorer: its frames are compared with the clean clip, its registration as in `TiltRemoval`.
+    """Trains a restorer: its frames are compared with the clean clip, its registration, if it has any, as in `TiltRemoval`.
 
     Args:
         tilt_weight, registration_weight, frequency_weight: of the tilt, registration and frequency losses.
@@ -20,6 +22,8 @@ class Restoration(SimulatedTask):
         start_from: checkpoint whose network to start from, such as one of `TiltRemoval`.
         more: see `SimulatedTask`.
     """
+
+    trains = (Restorer, UNet)
 
     def __init__(
         self,
@@ -42,17 +46,22 @@ class Restoration(SimulatedTask):
 
     def trained(self) -> Iterable[nn.Parameter]:
         """The network, or all of it but the tilt net."""
-        frozen = set(self.net.tilt.parameters()) if self.hparams["freeze_tilt"] else set()
+        frozen = set(self.net.tilt.parameters()) if self.hparams["freeze_tilt"] and self._registers else set()
         return [parameter for parameter in self.net.parameters() if parameter not in frozen]
+
+    @property
+    def _registers(self) -> bool:
+        return isinstance(self.net, Restorer)
 
     def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         pair = self.pair(batch)
-        stages = self.net.stages(pair.frames)
-        restored, registered = stages.frames, stages.registered
+        stages = self.net.stages(pair.frames) if self._registers else None
+        restored = stages.frames if stages else self.net(pair.frames)
         distance = charbonnier(restored, pair.target)
         loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
         values = {"charbonnier": distance}
-        if not self.hparams["freeze_tilt"]:
+        if stages and not self.hparams["freeze_tilt"]:
+            registered = stages.registered
             astray = registration_loss(pair.frames, pair.blur_only, registered.tilts)
             loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
             loss = loss + self.hparams["registration_weight"] * astray

@@ -34,8 +34,11 @@ class SimulatedTask(L.LightningModule):
         recipe: anything else worth recording in the model card.
 
     Raises:
-        InputError: a network that restores nothing, clips that it cannot take, a value out of range.
+        InputError: a network of another kind, clips that it cannot take, a value out of range.
     """
+
+    trains: tuple[type[nn.Module], ...] = (Restorer,)
+    """Kinds of network that the task knows how to train."""
 
     def __init__(
         self,
@@ -65,8 +68,9 @@ class SimulatedTask(L.LightningModule):
             }
         )
         restorer = build(net)
-        if not isinstance(restorer, Restorer):
-            raise InputError(f"this task trains a restorer; the network {net.get('name')!r} is none")
+        if not isinstance(restorer, self.trains):
+            names = " or a ".join(kind.__name__ for kind in self.trains)
+            raise InputError(f"this task trains a {names}; the network {net.get('name')!r} is none")
         for side in ("height", "width"):
             if simulator[side] % restorer.size_multiple:
                 raise InputError(
