@@ -90,7 +90,10 @@ def sheet(rows: dict[str, Clip]) -> Image.Image:
         draw.text((2, top + 2), name, fill="black")
         through_time = clip[:, height // 2].repeat(max(1, height // count), 0)[:height]
         for column, picture in enumerate((clip[0], clip[count // 2], clip[-1], through_time)):
-            paper.paste(Image.fromarray((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)), (column * (width + GAP), top + TITLE))
+            paper.paste(
+                Image.fromarray((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)),
+                (column * (width + GAP), top + TITLE),
+            )
     return paper
 
 
