@@ -188,6 +188,18 @@ def test_a_sweep(command, tmp_path):
     assert first["train/loss"] != second["train/loss"]
 
 
+@pytest.mark.slow
+def test_a_sweep_of_submitit(tmp_path):
+    """The jobs of a sweep in processes of their own."""
+    pytest.importorskip("submitit", reason="needs turbnet[cluster]")
+    launcher = ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10"]
+    code, _, err = in_a_process_of_its_own("-m", *launcher, *SECONDS, "seed=0,1", cwd=tmp_path)
+    assert code == 0, err
+    (sweep,) = (tmp_path / "outputs" / "sweep").iterdir()
+    assert [OmegaConf.load(sweep / job / "config.yaml").seed for job in "01"] == [0, 1]
+    assert all((sweep / job / "checkpoints" / "last.ckpt").is_file() for job in "01")
+
+
 def test_configs_of_a_user(command, tmp_path):
     (tmp_path / "my_configs" / "experiment").mkdir(parents=True)
     (tmp_path / "my_configs" / "experiment" / "mine.yaml").write_text(
