@@ -79,7 +79,8 @@ def test_untrained_it_gives_the_reference():
     out = build(CONFIG).stages(clip)
     torch.testing.assert_close(out.scene, out.registered.reference, rtol=0, atol=1e-5)
     gate = torch.sigmoid(torch.tensor(-2.0))
-    expected = out.scene + gate * (out.registered.frames - out.scene)
+    torch.testing.assert_close(out.own, (clip + out.registered.frames) / 2, rtol=0, atol=1e-5)
+    expected = out.scene + gate * (out.own - out.scene)
     torch.testing.assert_close(out.frames, expected, rtol=0, atol=1e-5)
 
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from turbnet.nets.restorer import Past, Restored
 from turbnet.nets.tilt import SCALES, Registered
-from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, registration_loss, tilt_error, tilt_loss
+from turbnet.tasks.losses import charbonnier, frequency_loss, gate_loss, psnr, registration_loss, tilt_error, tilt_loss
 
 
 def test_charbonnier():
@@ -102,3 +103,29 @@ class TestAtTheTruth:
         expected = 0.1 * math.sqrt(math.pi) / 2
         # 100,000 moduli, relative deviation 0.52 each; few frequencies are real and have another mean.
         assert float(frequency_loss(a[:, :1] + noise, a[:, :1].expand_as(noise))) == pytest.approx(expected, rel=0.01)
+
+
+def gated(gate: float, own: float, scene: float) -> Restored:
+    """What a restorer returns for a black clip of two frames if its parts are off by so much."""
+    flat = torch.zeros(1, 2, 3, 8, 8)
+    nothing = Past(flat, flat, flat)
+    logit = torch.full((1, 2, 1, 8, 8), gate)
+    return Restored(flat, flat[:, :1] + scene, flat + own, logit, Registered(flat, [], [], flat[:, :1]), nothing)
+
+
+@pytest.mark.parametrize(("own", "scene", "share"), [(0.0, 0.0, 0.5), (0.1, 0.14, 0.881), (0.14, 0.1, 0.119)])
+def test_the_gate_wants_what_is_nearer(own, scene, share):
+    """The loss is least where the gate's value is sigmoid((e_scene - e_own) / 0.02)."""
+    logits = torch.linspace(-4, 4, 161)
+    losses = torch.stack([gate_loss(gated(float(z), own, scene), torch.zeros(1, 2, 3, 8, 8)) for z in logits])
+    best = torch.sigmoid(logits[losses.argmin()])
+    assert float(best) == pytest.approx(share, abs=0.02)
+
+
+def test_the_gates_loss_moves_the_gate_alone():
+    made = gated(0.0, 0.1, 0.2)
+    parts = [part.requires_grad_() for part in (made.gate, made.own, made.scene)]
+    gate_loss(made, torch.zeros(1, 2, 3, 8, 8)).backward()
+    assert parts[0].grad.abs().sum() > 0
+    assert parts[1].grad is None
+    assert parts[2].grad is None

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from turbnet.nets.scene import LuckyFusion, OwnFrame, SceneNet
+from turbnet.nets.own import OwnFrame
+from turbnet.nets.scene import LuckyFusion, SceneNet
 from turbnet.nets.tcja import TCJATransformer
 from turbnet.nets.tilt import Registered, TiltNet
 
@@ -35,25 +36,28 @@ class Restored(NamedTuple):
     Attributes:
         frames: restored frames (B, T, C, H, W).
         scene: the still scene (B, 1, C, H, W).
-        gate: where a frame is not the still scene, (B, T, 1, H, W), 0 to 1.
+        own: every frame by itself (B, T, C, H, W).
+        gate: logit of where a frame is itself and not the still scene, (B, T, 1, H, W).
         registered: what tilt removal made of the clip.
         seen: what there is to carry on of these frames and those before.
     """
 
     frames: Tensor
     scene: Tensor
+    own: Tensor
     gate: Tensor
     registered: Registered
     seen: Past
 
 
 class Restorer(nn.Module):
-    """Registers a clip and restores every frame of it: out = scene + gate (own - scene).
+    """Registers a clip and restores every frame of it: see `turbnet.nets.own` for the last step.
 
     Args:
         tilt: arguments of `TiltNet`.
         tcja: arguments of `TCJATransformer`.
         scene: `widths` and `depths` of `SceneNet`.
+        own: `width` and `depth` of `OwnFrame`.
         fusions: pictures of the lucky fusion.
     """
 
@@ -62,6 +66,7 @@ class Restorer(nn.Module):
         tilt: Mapping[str, Any] | None = None,
         tcja: Mapping[str, Any] | None = None,
         scene: Mapping[str, Any] | None = None,
+        own: Mapping[str, Any] | None = None,
         fusions: int = 3,
     ) -> None:
         super().__init__()
@@ -70,7 +75,7 @@ class Restorer(nn.Module):
         width, patch = self.tcja.width, self.tcja.patch
         self.fusion = LuckyFusion(width, patch, fusions)
         self.scene = SceneNet(3 * fusions, width, **(scene or {}))
-        self.own = OwnFrame(width, patch)
+        self.own = OwnFrame(width, patch, **(own or {}))
         self.size_multiple = math.lcm(self.tilt.size_multiple, patch, self.scene.size_multiple)
 
     def stages(self, frames_BTCHW: Tensor, past: Past | None = None) -> Restored:
@@ -89,14 +94,14 @@ class Restorer(nn.Module):
             earlier = torch.cat((past.pictures[:, :, :-1], past.pictures[:, :, -1:] + _NO_WEIGHT), dim=2)
         pictures, weight = self.fusion(registered.frames, features, confidence, earlier)
         scene = self.scene(pictures.flatten(1, 2), gathered)[:, None]
-        own, gate = self.own(registered.frames, features)
+        own, gate = self.own(frames_BTCHW, registered.frames, scene, features)
         total = confidence.sum(1) if past is None else confidence.sum(1) + past.reference[:, -1:]
         seen = Past(
             torch.cat((registered.reference[:, 0], total), dim=1),
             memory,
             torch.cat((pictures, (weight - _NO_WEIGHT).clamp(min=0)), dim=2),
         )
-        return Restored(scene + gate * (own - scene), scene, gate, registered, seen)
+        return Restored(scene + torch.sigmoid(gate) * (own - scene), scene, own, gate, registered, seen)
 
     def forward(self, frames_BTCHW: Tensor) -> Tensor:
         """Restored frames (B, T, C, H, W), sRGB-encoded in [0, 1] like the input; H and W multiples of `size_multiple`."""

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbnet.nets.blocks import ResidualBlock, conv3x3, each_frame, zero_start
+from turbnet.nets.blocks import ResidualBlock, conv3x3, zero_start
 
 
 class LuckyFusion(nn.Module):
@@ -109,27 +109,3 @@ class SceneNet(nn.Module):
 
 def _blocks(width: int, depth: int) -> nn.Sequential:
     return nn.Sequential(*(ResidualBlock(width) for _ in range(depth)))
-
-
-class OwnFrame(nn.Module):
-    """A light correction of every frame, and where it counts instead of the still scene: where something moves.
-
-    Args:
-        width: channels of the frames' features.
-        patch: features are at 1/patch of the resolution.
-        channels: of the frames.
-    """
-
-    def __init__(self, width: int, patch: int, channels: int = 3) -> None:
-        super().__init__()
-        self.patch = patch
-        self.correct = conv3x3(width, channels * patch**2)
-        self.gate = conv3x3(width, patch**2)
-        zero_start(self.correct)
-        zero_start(self.gate, bias=-2.0)  # near the still scene
-
-    def forward(self, frames_BTCHW: Tensor, features_BTCHW: Tensor) -> tuple[Tensor, Tensor]:
-        """Corrected frames (B, T, C, H, W) and the gate (B, T, 1, H, W), 0: the still scene, 1: the frame."""
-        own = frames_BTCHW + each_frame(lambda f: F.pixel_shuffle(self.correct(f), self.patch), features_BTCHW)
-        gate = each_frame(lambda f: F.pixel_shuffle(self.gate(f), self.patch), features_BTCHW)
-        return own, torch.sigmoid(gate)

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbnet.nets.blocks import warp
+from turbnet.nets.restorer import Restored
 from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, Registered
 
 
@@ -63,3 +64,18 @@ def frequency_loss(a: Tensor, b: Tensor) -> Tensor:
     """Mean absolute difference of the (orthonormal) Fourier transforms: fine detail counts as much as coarse."""
     difference = torch.fft.rfft2(a.float() - b.float(), norm="ortho")
     return torch.sqrt(difference.real.square() + difference.imag.square() + 1e-8).mean()
+
+
+def gate_loss(restored: Restored, target: Tensor) -> Tensor:
+    r"""Binary cross-entropy of the gate against which is nearer the target, the frame itself or the still scene.
+
+    The wanted gate is sigmoid((e_scene - e_own) / 0.02), e the absolute error, mean over 5 x 5 pixels and channels. Learned
+    from the restored frames alone a gate closes in the first steps, when the scene is the better everywhere, and stays so.
+    """
+    with torch.no_grad():
+        scene, own = (
+            F.avg_pool2d((x.float() - target.float()).abs().mean(2), 5, 1, 2, count_include_pad=False)
+            for x in (restored.scene, restored.own)
+        )
+        wanted = torch.sigmoid((scene - own) / 0.02)[:, :, None]
+    return F.binary_cross_entropy_with_logits(restored.gate.float(), wanted)

@@ -9,7 +9,7 @@ from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.nets.restorer import Restorer
 from turbnet.nets.unet import UNet
 from turbnet.tasks.checkpoint import load_net
-from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, registration_loss, tilt_error, tilt_loss
+from turbnet.tasks.losses import charbonnier, frequency_loss, gate_loss, psnr, registration_loss, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
 
 
@@ -17,7 +17,8 @@ class Restoration(SimulatedTask):
     """Trains a restorer: its frames are compared with the clean clip, its registration, if it has any, as in `TiltRemoval`.
 
     Args:
-        tilt_weight, registration_weight, frequency_weight: of the tilt, registration and frequency losses.
+        tilt_weight, registration_weight, frequency_weight, own_weight, gate_weight: of the tilt, registration and frequency
+            losses, of the distance of the frames restored by themselves, of the gate's loss.
         freeze_tilt: keep the tilt net as it is; then its losses have no weight.
         start_from: checkpoint whose network to start from, such as one of `TiltRemoval`.
         more: see `SimulatedTask`.
@@ -30,6 +31,8 @@ class Restoration(SimulatedTask):
         tilt_weight: float = 0.003,
         registration_weight: float = 0.2,
         frequency_weight: float = 0.1,
+        own_weight: float = 0.2,
+        gate_weight: float = 0.02,
         freeze_tilt: bool = False,
         start_from: str | None = None,
         **more: Any,
@@ -38,6 +41,8 @@ class Restoration(SimulatedTask):
             tilt_weight=tilt_weight,
             registration_weight=registration_weight,
             frequency_weight=frequency_weight,
+            own_weight=own_weight,
+            gate_weight=gate_weight,
             freeze_tilt=freeze_tilt,
             **more,
         )
@@ -60,6 +65,10 @@ class Restoration(SimulatedTask):
         distance = charbonnier(restored, pair.target)
         loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
         values = {"charbonnier": distance}
+        if stages:
+            values["own"] = charbonnier(stages.own, pair.target)
+            values["gate"] = gate_loss(stages, pair.target)
+            loss = loss + self.hparams["own_weight"] * values["own"] + self.hparams["gate_weight"] * values["gate"]
         if stages and not self.hparams["freeze_tilt"]:
             registered = stages.registered
             astray = registration_loss(pair.frames, pair.blur_only, registered.tilts)
