@@ -113,9 +113,9 @@ def gated(gate: float, own: float, scene: float) -> Restored:
     return Restored(flat, flat[:, :1] + scene, flat + own, logit, Registered(flat, [], [], flat[:, :1]), nothing)
 
 
-@pytest.mark.parametrize(("own", "scene", "share"), [(0.0, 0.0, 0.5), (0.1, 0.14, 0.881), (0.14, 0.1, 0.119)])
+@pytest.mark.parametrize(("own", "scene", "share"), [(0.0, 0.0, 0.5), (0.1, 0.104, 0.881), (0.104, 0.1, 0.119)])
 def test_the_gate_wants_what_is_nearer(own, scene, share):
-    """The loss is least where the gate's value is sigmoid((e_scene - e_own) / 0.02)."""
+    """The loss is least where the gate's value is sigmoid((e_scene - e_own) / 0.002)."""
     logits = torch.linspace(-4, 4, 161)
     losses = torch.stack([gate_loss(gated(float(z), own, scene), torch.zeros(1, 2, 3, 8, 8)) for z in logits])
     best = torch.sigmoid(logits[losses.argmin()])

@@ -14,7 +14,9 @@ def main(arguments: list[str]) -> int:
 
 
 def export(
-    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="written by turbnet train")],
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="CHECKPOINT", help="written by turbnet train, or a released network's name")
+    ],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="default: beside the checkpoint, .onnx")] = None,
     frames: Annotated[
         int | None,

@@ -15,7 +15,7 @@ from turbnet.tasks.checkpoint import load_net, read_checkpoint
 
 
 def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
-    """The network in a checkpoint, ready to run, and the checkpoint's hyper-parameters.
+    """The network in a checkpoint, or a released one by name, ready to run, and the checkpoint's hyper-parameters.
 
     Raises:
         InputError: no file, no checkpoint, one of other software, or weights that do not fit the network it names.

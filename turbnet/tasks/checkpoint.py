@@ -8,17 +8,21 @@ import torch
 from torch import Tensor
 
 from turbnet.errors import InputError
+from turbnet.weights.released import read_card, read_weights, released_networks
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint of a task, loaded with `weights_only=True`.
+    """A checkpoint of a task, loaded with `weights_only=True`; of a released network's name, its weights in that form.
 
     Raises:
         InputError: there is no such file, it is no checkpoint, or it is none of ours.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"there is no checkpoint {path}")
+        if str(path) in released_networks():
+            return _released(str(path))
+        names = ", ".join(released_networks()) or "none in this installation"
+        raise InputError(f"there is no checkpoint {path}, nor a released network of this name ({names})")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # of bytes that are no pickle, the unpickler raises whatever they lead it to
@@ -28,6 +32,19 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not isinstance(hyper, dict) or not isinstance(hyper.get("net"), dict) or "state_dict" not in checkpoint:
         raise InputError(f"{path} is not a checkpoint of turbnet: it does not say which network it holds")
     return checkpoint
+
+
+def _released(name: str) -> dict[str, Any]:
+    """A released network as the checkpoint it was exported from, as far as its card tells."""
+    weights, card = read_weights(name), read_card(name)
+    return {
+        "hyper_parameters": {
+            "net": {"name": card["architecture"], **card["config"]},
+            "seed": card["seed"],
+            "recipe": {**card["notes"], "frames": card["frames"]},
+        },
+        "state_dict": {f"net.{key}": value for key, value in weights.items()},
+    }
 
 
 def load_net(path: str | Path, expect: Mapping[str, Any] | None = None) -> dict[str, Tensor]:

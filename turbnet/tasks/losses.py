@@ -69,7 +69,7 @@ def frequency_loss(a: Tensor, b: Tensor) -> Tensor:
 def gate_loss(restored: Restored, target: Tensor) -> Tensor:
     r"""Binary cross-entropy of the gate against which is nearer the target, the frame itself or the still scene.
 
-    The wanted gate is sigmoid((e_scene - e_own) / 0.02), e the absolute error, mean over 5 x 5 pixels and channels. Learned
+    The wanted gate is sigmoid((e_scene - e_own) / 0.002), e the absolute error, mean over 5 x 5 pixels and channels. Learned
     from the restored frames alone a gate closes in the first steps, when the scene is the better everywhere, and stays so.
     """
     with torch.no_grad():
@@ -77,5 +77,5 @@ def gate_loss(restored: Restored, target: Tensor) -> Tensor:
             F.avg_pool2d((x.float() - target.float()).abs().mean(2), 5, 1, 2, count_include_pad=False)
             for x in (restored.scene, restored.own)
         )
-        wanted = torch.sigmoid((scene - own) / 0.02)[:, :, None]
+        wanted = torch.sigmoid((scene - own) / 0.002)[:, :, None]
     return F.binary_cross_entropy_with_logits(restored.gate.float(), wanted)
