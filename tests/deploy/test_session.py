@@ -101,7 +101,7 @@ def test_wrong_shapes_are_named(model_file, shape):
         Model.load(model_file)(np.zeros(shape, np.float32))
 
 
-@pytest.mark.parametrize("threads", [-1, 5000])
+@pytest.mark.parametrize("threads", [-1, 0, 5000])
 def test_threads_out_of_range(model_file, threads):
     with pytest.raises(InputError, match="threads"):
         Model.load(model_file, threads=threads)

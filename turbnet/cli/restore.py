@@ -34,7 +34,7 @@ def restore(
     from turbnet.deploy.method import ClassicalMethod
     from turbnet.deploy.restore import restore_clip
     from turbnet.deploy.session import Model
-    from turbnet.deploy.weights import find_model
+    from turbnet.deploy.weights import DEFAULT, find_model
     from turbnet.errors import InputError
     from turbnet.media.atomic import check_output
     from turbnet.report import Report, Row
@@ -46,7 +46,7 @@ def restore(
     done = restore_clip(
         source,
         output,
-        ClassicalMethod(method, threads) if method else Model.load(find_model(model or "small"), threads),
+        ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads),
         crop=parse_crop(crop),
         tile=tile,
         window=window,

@@ -30,7 +30,8 @@ class ClassicalMethod:
         if name not in METHODS:
             raise InputError(f"there is no method {name}; the methods are {', '.join(METHODS)}")
         self._restore = METHODS[name]
-        self._cores = int(check_range("threads", threads or available_cores(), 1, 1024))
+        threads = available_cores() if threads is None else threads
+        self._cores = int(check_range("threads", threads, 1, 1024))
         self.card = ModelCard(architecture=name, config={}, size_multiple=1, frames=WINDOW)
 
     def __call__(self, frames_BTCHW: np.ndarray, report: Callable[[float], object] = lambda share: None) -> np.ndarray:

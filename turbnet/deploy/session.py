@@ -32,7 +32,9 @@ class Model:
     def __init__(self, data: bytes, threads: int | None = None) -> None:
         verify(data)
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = int(check_range("threads", threads or available_cores(), 1, 1024))
+        options.intra_op_num_threads = int(
+            check_range("threads", available_cores() if threads is None else threads, 1, 1024)
+        )
         options.inter_op_num_threads = 1
         options.log_severity_level = 4  # errors reach the user as InputError, not through onnxruntime's log
         # Activations that fade into denormal numbers slow a processor down tenfold.

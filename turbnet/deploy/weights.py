@@ -5,6 +5,9 @@ from pathlib import Path
 
 from turbnet.errors import InputError
 
+DEFAULT = "small"
+"""The released network that restores unless another is asked for."""
+
 RECOGNISER = "recogniser"
 """Name of the released network that reads text; it restores nothing."""
 
