@@ -57,6 +57,24 @@ def test_report_of_a_clip(model_file, tmp_path):
         assert sum(1 for _ in clip) == 8
 
 
+def test_a_second_pass_restores_what_the_first_left(model_file, tmp_path):
+    with open_writer(tmp_path / "in.tiff") as writer:
+        for frame_HWC in noise(8):
+            writer.write(frame_HWC)
+    model = Model.load(model_file)
+    done = restore_clip(tmp_path / "in.tiff", tmp_path / "twice.tiff", model, passes=2)
+    assert done.frames == 8
+    with open_clip(tmp_path / "in.tiff") as clip:
+        tiling = Tiling(384, 32, 4)
+        once = restore_frames(clip, model, tiling, 6)
+        expected = np.stack(list(restore_frames(once, model, tiling, 6)))
+    with open_clip(tmp_path / "twice.tiff") as clip:
+        np.testing.assert_allclose(np.stack(list(clip)), expected, rtol=0, atol=1 / 255)
+    with pytest.raises(InputError, match="passes = 0"):
+        restore_clip(tmp_path / "in.tiff", tmp_path / "none.tiff", model, passes=0)
+    assert not (tmp_path / "none.tiff").exists()
+
+
 def test_models_by_name_and_by_path(model_file, tmp_path, monkeypatch):
     assert find_model(model_file) == model_file
     for name, path in released_models().items():

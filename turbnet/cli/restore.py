@@ -24,6 +24,9 @@ def restore(
     ] = None,
     crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
+    passes: Annotated[
+        int, typer.Option(help="how often; a second pass for blur stronger than one can undo, text above all")
+    ] = 1,
     tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 384,
     threads: Annotated[int | None, typer.Option(help="processor threads; default: all cores")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
@@ -50,6 +53,7 @@ def restore(
         crop=parse_crop(crop),
         tile=tile,
         window=window,
+        passes=passes,
         quiet=quiet,
     )
     if json:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,7 @@ def restore_clip(
     tile: int = TILE,
     overlap: int | None = None,
     window: int | None = None,
+    passes: int = 1,
     quiet: bool = True,
 ) -> Restoration:
     """Restore the clip in the file `source` into the file `destination`, which appears whole or not at all.
@@ -123,6 +125,7 @@ def restore_clip(
         tile: greatest side of a tile, pixels.
         overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
         window: frames restored together; None: what the model's card recommends, 50 for a classical method.
+        passes: how often; a second pass restores what the first one left, for blur stronger than a network can undo at once.
         quiet: no progress bar on standard error.
 
     Raises:
@@ -132,6 +135,7 @@ def restore_clip(
     if model.card.carried and window not in (None, 1):
         raise InputError(f"window = {window}: the model goes frame by frame")
     window = int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
+    passes = int(check_range("passes", passes, 1, 8))
     count, inside, start = 0, 0.0, time.perf_counter()
     with (
         open_clip(source, crop) as clip,
@@ -141,10 +145,9 @@ def restore_clip(
         info = clip.info
         tiles = tiling.count(info.height, info.width)
         windows = window_count(info.frames, window, window_overlap(window)) if info.frames else None
-        task = progress.add_task("restoring", total=windows and windows * tiles)
-        whole = FrameByFrame(model, tiles) if isinstance(model, Model) and model.card.carried else model
+        task = progress.add_task("restoring", total=windows and windows * tiles * passes)
 
-        def network(frames_BTCHW: np.ndarray) -> np.ndarray:
+        def timed(frames_BTCHW: np.ndarray, whole: Model | ClassicalMethod | FrameByFrame) -> np.ndarray:
             nonlocal inside
             began = time.perf_counter()
             if isinstance(whole, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
@@ -155,7 +158,11 @@ def restore_clip(
             inside += time.perf_counter() - began
             return restored_BTCHW
 
-        for frame_HWC in restore_frames(clip, network, tiling, window):
+        frames: Iterable[np.ndarray] = clip
+        for _ in range(passes):
+            whole = FrameByFrame(model, tiles) if isinstance(model, Model) and model.card.carried else model
+            frames = restore_frames(frames, partial(timed, whole=whole), tiling, window)
+        for frame_HWC in frames:
             writer.write(frame_HWC)
             count += 1
     seconds = time.perf_counter() - start
