@@ -6,7 +6,16 @@ import torch.nn.functional as F
 
 from turbnet.nets.restorer import Past, Restored
 from turbnet.nets.tilt import SCALES, Registered
-from turbnet.tasks.losses import charbonnier, frequency_loss, gate_loss, psnr, registration_loss, tilt_error, tilt_loss
+from turbnet.tasks.losses import (
+    charbonnier,
+    frequency_loss,
+    gate_loss,
+    moving_weights,
+    psnr,
+    registration_loss,
+    tilt_error,
+    tilt_loss,
+)
 
 
 def test_charbonnier():
@@ -103,6 +112,17 @@ class TestAtTheTruth:
         expected = 0.1 * math.sqrt(math.pi) / 2
         # 100,000 moduli, relative deviation 0.52 each; few frequencies are real and have another mean.
         assert float(frequency_loss(a[:, :1] + noise, a[:, :1].expand_as(noise))) == pytest.approx(expected, rel=0.01)
+
+
+def test_what_moves_counts_more():
+    clip = torch.full((1, 4, 3, 6, 8), 0.5)
+    clip[:, 1, :, 2, 3] = 0.9  # its mean over time is 0.6: it is seen to move in every frame
+    weights = moving_weights(clip, 6.0)
+    assert weights.shape == (1, 4, 1, 6, 8)
+    assert (weights[..., 2, 3] == 6).all()
+    assert float(weights.sum()) == 4 * (6 * 8 - 1) + 4 * 6
+    error = charbonnier(clip + 0.1, clip, epsilon=0.0, weight=weights)
+    assert float(error) == pytest.approx(0.1 * (47 + 6) / 48, rel=1e-5)
 
 
 def gated(gate: float, own: float, scene: float) -> Restored:

@@ -11,9 +11,15 @@ from turbnet.nets.restorer import Restored
 from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, Registered
 
 
-def charbonnier(a: Tensor, b: Tensor, epsilon: float = 1e-3) -> Tensor:
-    """Mean of sqrt((a-b)^2 + epsilon^2): absolute error, smooth at zero."""
-    return torch.sqrt((a.float() - b.float()).square() + epsilon**2).mean()
+def charbonnier(a: Tensor, b: Tensor, epsilon: float = 1e-3, weight: Tensor | float = 1.0) -> Tensor:
+    """Mean of weight sqrt((a-b)^2 + epsilon^2): absolute error, smooth at zero."""
+    return (weight * torch.sqrt((a.float() - b.float()).square() + epsilon**2)).mean()
+
+
+def moving_weights(clip_BTCHW: Tensor, weight: float) -> Tensor:
+    """`weight` where a clean clip moves (it differs from its mean over time by over 0.01), 1 elsewhere; (B, T, 1, H, W)."""
+    moves = (clip_BTCHW - clip_BTCHW.mean(1, keepdim=True)).abs().mean(2, keepdim=True) > 0.01
+    return 1 + (weight - 1) * moves.float()
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:

@@ -9,7 +9,16 @@ from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.nets.restorer import Restorer
 from turbnet.nets.unet import UNet
 from turbnet.tasks.checkpoint import load_net
-from turbnet.tasks.losses import charbonnier, frequency_loss, gate_loss, psnr, registration_loss, tilt_error, tilt_loss
+from turbnet.tasks.losses import (
+    charbonnier,
+    frequency_loss,
+    gate_loss,
+    moving_weights,
+    psnr,
+    registration_loss,
+    tilt_error,
+    tilt_loss,
+)
 from turbnet.tasks.simulated import SimulatedTask
 
 
@@ -19,6 +28,7 @@ class Restoration(SimulatedTask):
     Args:
         tilt_weight, registration_weight, frequency_weight, own_weight, gate_weight: of the tilt, registration and frequency
             losses, of the distance of the frames restored by themselves, of the gate's loss.
+        moving_weight: of pixels that move of themselves, against those that do not: they are few.
         freeze_tilt: keep the tilt net as it is; then its losses have no weight.
         start_from: checkpoint whose network to start from, such as one of `TiltRemoval`.
         more: see `SimulatedTask`.
@@ -33,6 +43,7 @@ class Restoration(SimulatedTask):
         frequency_weight: float = 0.1,
         own_weight: float = 0.2,
         gate_weight: float = 0.02,
+        moving_weight: float = 6.0,
         freeze_tilt: bool = False,
         start_from: str | None = None,
         **more: Any,
@@ -43,6 +54,7 @@ class Restoration(SimulatedTask):
             frequency_weight=frequency_weight,
             own_weight=own_weight,
             gate_weight=gate_weight,
+            moving_weight=moving_weight,
             freeze_tilt=freeze_tilt,
             **more,
         )
@@ -62,11 +74,12 @@ class Restoration(SimulatedTask):
         pair = self.pair(batch)
         stages = self.net.stages(pair.frames) if self._registers else None
         restored = stages.frames if stages else self.net(pair.frames)
-        distance = charbonnier(restored, pair.target)
+        counts = moving_weights(pair.target, self.hparams["moving_weight"])
+        distance = charbonnier(restored, pair.target, weight=counts)
         loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
         values = {"charbonnier": distance}
         if stages:
-            values["own"] = charbonnier(stages.own, pair.target)
+            values["own"] = charbonnier(stages.own, pair.target, weight=counts)
             values["gate"] = gate_loss(stages, pair.target)
             loss = loss + self.hparams["own_weight"] * values["own"] + self.hparams["gate_weight"] * values["gate"]
         if stages and not self.hparams["freeze_tilt"]:
