@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from turbnet.nets.inverse import InverseFilters
 from turbnet.nets.own import OwnFrame
 from turbnet.nets.scene import LuckyFusion, SceneNet
 from turbnet.nets.tcja import TCJATransformer
@@ -58,6 +59,7 @@ class Restorer(nn.Module):
         tcja: arguments of `TCJATransformer`.
         scene: `widths` and `depths` of `SceneNet`.
         own: `width` and `depth` of `OwnFrame`.
+        inverse: arguments of `InverseFilters`.
         fusions: pictures of the lucky fusion.
     """
 
@@ -67,6 +69,7 @@ class Restorer(nn.Module):
         tcja: Mapping[str, Any] | None = None,
         scene: Mapping[str, Any] | None = None,
         own: Mapping[str, Any] | None = None,
+        inverse: Mapping[str, Any] | None = None,
         fusions: int = 3,
     ) -> None:
         super().__init__()
@@ -74,7 +77,9 @@ class Restorer(nn.Module):
         self.tcja = TCJATransformer(**(tcja or {}))
         width, patch = self.tcja.width, self.tcja.patch
         self.fusion = LuckyFusion(width, patch, fusions)
-        self.scene = SceneNet(3 * fusions, width, **(scene or {}))
+        self.inverse = InverseFilters(**(inverse or {}))
+        filters = len(self.inverse.weight)
+        self.scene = SceneNet(3 * (fusions + filters), width, blends=filters, **(scene or {}))
         self.own = OwnFrame(width, patch, **(own or {}))
         self.size_multiple = math.lcm(self.tilt.size_multiple, patch, self.scene.size_multiple)
 
@@ -93,7 +98,8 @@ class Restorer(nn.Module):
         if past is not None:
             earlier = torch.cat((past.pictures[:, :, :-1], past.pictures[:, :, -1:] + _NO_WEIGHT), dim=2)
         pictures, weight = self.fusion(registered.frames, features, confidence, earlier)
-        scene = self.scene(pictures.flatten(1, 2), gathered)[:, None]
+        sharpened = self.inverse(pictures[:, 0])
+        scene = self.scene(torch.cat((pictures, sharpened), dim=1).flatten(1, 2), gathered)[:, None]
         own, gate = self.own(frames_BTCHW, registered.frames, scene, features)
         total = confidence.sum(1) if past is None else confidence.sum(1) + past.reference[:, -1:]
         seen = Past(

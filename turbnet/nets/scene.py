@@ -6,8 +6,9 @@ First a learned lucky fusion: K pictures, each a mean of the registered frames w
     F_k(x) = \sum_t w_{k,t}(x)\, I_t(x), \qquad w_{k,t} = \mathrm{softmax}_t\, (\ell_{k,t} + \log c_t)
 
 from logits l that the frames' features give and the confidence c of the registration. Then a U-Net on half, a quarter and
-an eighth of the resolution sharpens the first of them, knowing the others and what the reference gathered. However many
-frames a clip has, this part runs once: a deep network at a small cost a frame.
+an eighth of the resolution sharpens the first of them, knowing the others, what inverse filters (`turbnet.nets.inverse`)
+make of the first, and what the reference gathered. However many frames a clip has, this part runs once: a deep network at a
+small cost a frame.
 """
 
 from collections.abc import Sequence
@@ -62,12 +63,15 @@ class LuckyFusion(nn.Module):
 class SceneNet(nn.Module):
     """U-Net over half, a quarter and an eighth of the resolution; corrects the first of the pictures it is given.
 
+    The last of them can be blended in with weights of their own at every pixel: F_1 + sum_k a_k (P_k - F_1) + c.
+
     Args:
-        inner: channels of the pictures.
+        inner: channels of all pictures.
         known: channels of further features at a quarter of the resolution; 0: none.
         widths: channels at the three scales.
         depths: residual blocks at each scale, on the way down; on the way up as many but at the coarsest.
         channels: of the picture corrected.
+        blends: pictures that are blended in.
     """
 
     size_multiple = 8
@@ -79,16 +83,17 @@ class SceneNet(nn.Module):
         widths: Sequence[int] = (32, 64, 96),
         depths: Sequence[int] = (1, 2, 4),
         channels: int = 3,
+        blends: int = 0,
     ) -> None:
         super().__init__()
-        self.channels = channels
+        self.channels, self.blends = channels, blends
         self.embed = conv3x3(4 * inner, widths[0])
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:], strict=False))
         self.know = nn.Conv2d(known, widths[1], 1) if known else None
         self.encode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths, depths, strict=True))
         self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in zip(widths, widths[1:], strict=False))
         self.decode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths[:-1], depths, strict=False))
-        self.correct = conv3x3(widths[0], 4 * channels)
+        self.correct = conv3x3(widths[0], 4 * (channels + blends))
         zero_start(self.correct)
 
     def forward(self, pictures_BCHW: Tensor, known_BCHW: Tensor | None = None) -> Tensor:
@@ -104,7 +109,12 @@ class SceneNet(nn.Module):
             x = encode(x)
         for scale in reversed(range(len(passed))):
             x = self.decode[scale](passed[scale] + F.pixel_shuffle(self.up[scale](x), 2))
-        return pictures_BCHW[:, : self.channels] + F.pixel_shuffle(self.correct(x), 2)
+        first, change = pictures_BCHW[:, : self.channels], F.pixel_shuffle(self.correct(x), 2)
+        out = first + change[:, : self.channels]
+        if self.blends:
+            others = pictures_BCHW[:, -self.blends * self.channels :].unflatten(1, (self.blends, self.channels))
+            out = out + (change[:, self.channels :, None] * (others - first[:, None])).sum(1)
+        return out
 
 
 def _blocks(width: int, depth: int) -> nn.Sequential:
