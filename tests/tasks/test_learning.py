@@ -86,8 +86,8 @@ def test_gradients_are_finite(kind, strength, batch):
     ("task", "learns"),
     [
         (make(TiltRemoval), {"tilt"}),
-        (make(Restoration), {"tilt", "tcja", "fusion", "scene", "own"}),
-        (make(Restoration, freeze_tilt=True), {"tcja", "fusion", "scene", "own"}),
+        (make(Restoration), {"tilt", "tcja", "fusion", "inverse", "scene", "own"}),
+        (make(Restoration, freeze_tilt=True), {"tcja", "fusion", "inverse", "scene", "own"}),
     ],
 )
 def test_what_a_task_learns(task, learns, batch):
