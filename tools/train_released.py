@@ -14,7 +14,6 @@ import hashlib
 import json
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -99,10 +98,10 @@ def release(checkpoint: Path, options: argparse.Namespace) -> None:
     network, hyper_parameters = load_network(checkpoint)
     weights = save({key: value.contiguous() for key, value in flush_denormals(network).state_dict().items()})
     frames = WINDOW[options.net]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{options.net}.onnx"
-        export_onnx(network, card_of(network, {**hyper_parameters, "recipe": {}}, frames), path)
-        measured = quality(path, options.suite)
+    options.output.mkdir(parents=True, exist_ok=True)
+    path = options.output / f"{options.net}.onnx"
+    export_onnx(network, card_of(network, {**hyper_parameters, "recipe": {}}, frames), path)
+    measured = quality(path, options.suite)
     hyper_parameters["recipe"] = {
         "data": options.data,
         "recipe": f"python tools/train_released.py {options.net} --pictures FOLDER",
@@ -123,9 +122,10 @@ def release(checkpoint: Path, options: argparse.Namespace) -> None:
 
 
 def quality(model: Path, suite: str) -> dict[str, str]:
-    """What the benchmark says of input and model, by kind of scene, length and strength."""
-    report = model.with_suffix(".bench.json")
-    command = ["bench", "restoration", "--suite", suite, "--model", str(model), "--json", str(report), "--quiet"]
+    """What the benchmark says of input and model, by kind of scene, length and strength; its report stays beside the model."""
+    report, table = model.with_suffix(".bench.json"), model.with_suffix(".bench.md")
+    command = ["bench", "restoration", "--suite", suite, "--model", str(model), "--json", str(report)]
+    command += ["--markdown", str(table), "--quiet"]
     subprocess.run([sys.executable, "-m", "turbnet", *command], check=True)
     rows: dict[str, float] = {row["name"]: row["value"] for row in json.loads(report.read_text())["rows"]}
     notes = {}
