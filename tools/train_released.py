@@ -122,7 +122,7 @@ def release(checkpoint: Path, options: argparse.Namespace) -> None:
 
 
 def quality(model: Path, suite: str) -> dict[str, str]:
-    """What the benchmark says of input and model, by kind of scene, length and strength; its report stays beside the model."""
+    """What the benchmark says of input and model, by kind, length and strength; its report stays beside the model."""
     report, table = model.with_suffix(".bench.json"), model.with_suffix(".bench.md")
     command = ["bench", "restoration", "--suite", suite, "--model", str(model), "--json", str(report)]
     command += ["--markdown", str(table), "--quiet"]
