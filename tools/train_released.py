@@ -44,6 +44,7 @@ def main() -> int:
     parser.add_argument("--data", default="photographs of a user's folder, rendered text", help="for the card")
     parser.add_argument("--history", default="one uninterrupted recipe", help="how it went, for the card")
     parser.add_argument("--failures", default="not looked into", help="known failures, for the card")
+    parser.add_argument("--steps", type=int, help="taken, for the card; default: as the checkpoint says")
     parser.add_argument("--output", type=Path, default=Path("outputs/released"))
     parser.add_argument("--weights", type=Path, default=Path(__file__).parents[1] / "turbnet" / "weights")
     parser.add_argument("--threads", type=int, default=2)
@@ -105,7 +106,7 @@ def release(checkpoint: Path, options: argparse.Namespace) -> None:
     hyper_parameters["recipe"] = {
         "data": options.data,
         "recipe": f"python tools/train_released.py {options.net} --pictures FOLDER",
-        "steps": torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"],
+        "steps": options.steps or torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"],
         "history": options.history,
         "measured by": f"turbnet bench restoration --suite {options.suite} --model {options.net}; means over scenes with "
         "95 % intervals",

@@ -88,7 +88,7 @@ def test_not_a_recogniser(tmp_path):
     with pytest.raises(InputError, match="was changed"):
         Recogniser(bytes(data))
     with pytest.raises(InputError, match="the model card cannot be read"):
-        Recogniser.load(released_models()["small"])
+        Recogniser.load(released_models()["s"])
 
 
 def test_needs_no_torch():

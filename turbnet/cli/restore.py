@@ -17,7 +17,7 @@ def restore(
     source: Annotated[Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video or TIFF")],
     output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what")],
     model: Annotated[
-        str | None, typer.Option(help="a released model by name, or an ONNX file of turbnet export; default: small")
+        str | None, typer.Option(help="a released model by name, or an ONNX file of turbnet export; default: s")
     ] = None,
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="a method without learning in place of a model: pipeline, ...")

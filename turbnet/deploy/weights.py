@@ -5,7 +5,7 @@ from pathlib import Path
 
 from turbnet.errors import InputError
 
-DEFAULT = "small"
+DEFAULT = "s"
 """The released network that restores unless another is asked for."""
 
 RECOGNISER = "recogniser"
