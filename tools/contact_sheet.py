@@ -9,7 +9,6 @@ through time (the middle row of pixels, time downwards): what stands still leave
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,12 @@ from PIL import Image, ImageDraw
 
 from turbnet.cli.options import parse_crop
 from turbnet.deploy.method import ClassicalMethod
-from turbnet.deploy.restore import OVERLAP, TILE, restore_frames
+from turbnet.deploy.restore import restore_array
 from turbnet.deploy.session import Model
-from turbnet.deploy.tiling import Tiling
 from turbnet.deploy.weights import find_model
 from turbnet.errors import InputError
 from turbnet.media.clip import open_clip
-from turbnet.media.colour import to_linear, to_srgb
+from turbnet.metrics.evaluation import TemporalMean
 from turbnet.metrics.sharpness import noise_level, sharpness
 from turbnet.metrics.stability import flicker, jitter
 
@@ -55,19 +53,15 @@ def main() -> int:
 def restorations(options: argparse.Namespace) -> dict[str, Clip]:
     with open_clip(options.clip, parse_crop(options.crop)) as clip:
         seen = np.stack([frame for _, frame in zip(range(options.frames), clip, strict=False)])
-    mean = to_srgb(to_linear(seen.astype(np.float64)).mean(0)).astype(np.float32)
-    rows: dict[str, Clip] = {"input": seen, "temporal mean": mean[None].repeat(len(seen), 0)}
+    mean = TemporalMean()
+    for frame in seen:
+        mean.add(frame)
+    rows: dict[str, Clip] = {"input": seen, "temporal mean": mean.frame()[None].repeat(len(seen), 0)}
     for name in options.methods:
-        rows[name] = restored(seen, ClassicalMethod(name))
+        rows[name] = restore_array(seen, ClassicalMethod(name))
     for name in options.models:
-        rows[Path(name).stem] = restored(seen, Model.load(find_model(name)))
+        rows[Path(name).stem] = restore_array(seen, Model.load(find_model(name)))
     return rows
-
-
-def restored(seen: Clip, network: Model | ClassicalMethod) -> Clip:
-    tiling = Tiling(TILE, OVERLAP, network.card.size_multiple)
-    run: Callable[[np.ndarray], np.ndarray] = network
-    return np.stack(list(restore_frames(seen, run, tiling, network.card.frames)))
 
 
 def figures(clip: Clip) -> tuple[float, float, float, float]:

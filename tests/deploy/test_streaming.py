@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from turbnet.deploy.card import ModelCard
-from turbnet.deploy.checkpoint import streaming
+from turbnet.deploy.checkpoint import frame_by_frame
 from turbnet.deploy.export import export_onnx
-from turbnet.deploy.restore import restore_clip
+from turbnet.deploy.restore import restore_array, restore_clip
 from turbnet.deploy.session import Model
 from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError
 from turbnet.media.clip import read_clip, write_clip
-from turbnet.nets import build
 from turbnet.nets.streaming import StreamingRestorer
 
 CONFIG = {
@@ -27,14 +26,8 @@ CONFIG = {
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> tuple[StreamingRestorer, Path]:
-    torch.manual_seed(4)
-    net = build(CONFIG)
-    with torch.no_grad():
-        for parameter in net.parameters():
-            if not parameter.any():
-                parameter.normal_(std=0.02)
-    wrapped, card = streaming(net.eval(), ModelCard("restorer", CONFIG, 8, 12), 10.0, 3)
+def made(trained, tmp_path_factory) -> tuple[StreamingRestorer, Path]:
+    wrapped, card = frame_by_frame(trained(CONFIG), ModelCard("restorer", CONFIG, 8, 12), 10.0, 3)
     path = tmp_path_factory.mktemp("model") / "stream.onnx"
     assert max(row.difference for row in export_onnx(wrapped, card, path)) < 1e-4
     assert "carried memory | (batch, 3, 33, height / 4, width / 4)" in card.to_markdown("stream")
@@ -86,6 +79,13 @@ def test_restoring_a_clip_frame_by_frame_in_tiles(model, tmp_path, tile):
     np.testing.assert_allclose(read_clip(tmp_path / "out.tif")[0], expected, rtol=0, atol=2e-4)
 
 
+def test_a_clip_in_memory_is_one_clip(model):
+    """What is carried reaches from the first frame to the last; a benchmark or a script sees what `restore` would write."""
+    clip = np.random.default_rng(1).random((4, 40, 48, 3), dtype=np.float32)
+    expected = np.moveaxis(model(np.moveaxis(clip, -1, 1)[None])[0], 1, -1).clip(0, 1)
+    np.testing.assert_allclose(restore_array(clip, model), expected, rtol=0, atol=1e-5)
+
+
 def test_a_window_has_no_meaning(model, tmp_path):
     write_clip(tmp_path / "in.tif", np.zeros((2, 40, 40, 3), np.float32))
     with pytest.raises(InputError, match="window = 5: the model goes frame by frame"):
@@ -94,4 +94,4 @@ def test_a_window_has_no_meaning(model, tmp_path):
 
 def test_only_a_restorer_goes_frame_by_frame():
     with pytest.raises(InputError, match="only a restorer"):
-        streaming(torch.nn.Identity(), ModelCard("identity", {}, 1, 1), 10.0, 3)
+        frame_by_frame(torch.nn.Identity(), ModelCard("identity", {}, 1, 1), 10.0, 3)

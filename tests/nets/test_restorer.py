@@ -15,17 +15,6 @@ CONFIG = {
 }
 
 
-def trained() -> Restorer:
-    """A net whose every weight takes part, as after training."""
-    torch.manual_seed(4)
-    net = build(CONFIG)
-    with torch.no_grad():
-        for parameter in net.parameters():
-            if not parameter.any():
-                parameter.normal_(std=0.02)
-    return net.eval()
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("frames", [1, 2, 7])
 def test_any_number_of_frames(frames):
@@ -46,8 +35,8 @@ def test_a_still_clip_stays_as_it_is():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6])
-def test_bfloat16_autocast_is_finite_and_near_float32(scale):
-    net = trained()
+def test_bfloat16_autocast_is_finite_and_near_float32(trained, scale):
+    net = trained(CONFIG)
     clip = scale * torch.rand(1, 3, 3, 16, 16)
     with torch.autocast("cpu", torch.bfloat16):
         half = net(clip)
@@ -85,20 +74,20 @@ def test_untrained_it_gives_the_reference():
 
 
 @torch.no_grad()
-def test_order_of_frames_does_not_matter():
-    net, clip = trained(), torch.rand(1, 5, 3, 16, 24)
+def test_order_of_frames_does_not_matter(trained):
+    net, clip = trained(CONFIG), torch.rand(1, 5, 3, 16, 24)
     order = torch.tensor([3, 0, 4, 1, 2])
     torch.testing.assert_close(net(clip[:, order]), net(clip)[:, order], rtol=0, atol=1e-4)
 
 
 @torch.no_grad()
-def test_clips_of_a_batch_do_not_mix():
-    net, clips = trained(), torch.rand(2, 3, 3, 16, 24)
+def test_clips_of_a_batch_do_not_mix(trained):
+    net, clips = trained(CONFIG), torch.rand(2, 3, 3, 16, 24)
     torch.testing.assert_close(net(clips)[1:], net(clips[1:]), rtol=0, atol=1e-4)
 
 
-def test_every_weight_learns():
-    net = trained()
+def test_every_weight_learns(trained):
+    net = trained(CONFIG)
     net(torch.rand(1, 3, 3, 16, 16)).square().mean().backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
@@ -107,9 +96,9 @@ def test_every_weight_learns():
 
 
 @torch.no_grad()
-def test_the_lucky_fusion_is_a_mean_over_time():
+def test_the_lucky_fusion_is_a_mean_over_time(trained):
     """Its weights are positive and sum to one, so that it stays within what the frames hold at each pixel."""
-    net = trained()
+    net = trained(CONFIG)
     clip = torch.rand(1, 5, 3, 16, 16)
     registered = net.tilt(clip)
     _, features, _ = net.tcja(registered.reference, registered.frames, registered.confidence)

@@ -18,17 +18,6 @@ CONFIG = {
 }
 
 
-def trained() -> Restorer:
-    """A net whose every weight takes part, as after training."""
-    torch.manual_seed(4)
-    net = build(CONFIG)
-    with torch.no_grad():
-        for parameter in net.parameters():
-            if not parameter.any():
-                parameter.normal_(std=0.02)
-    return net.eval()
-
-
 def unregistered() -> Restorer:
     """A net as before training, which takes frames as they are."""
     net = build(CONFIG).eval()
@@ -48,9 +37,9 @@ def run(streaming: StreamingRestorer, clip: torch.Tensor, sizes: list[int]) -> t
 
 
 @torch.no_grad()
-def test_the_first_part_is_what_the_restorer_makes_of_it():
+def test_the_first_part_is_what_the_restorer_makes_of_it(trained):
     """Zeros carried along are nothing seen."""
-    net, clip = trained(), torch.rand(2, 3, 3, 16, 24)
+    net, clip = trained(CONFIG), torch.rand(2, 3, 3, 16, 24)
     torch.testing.assert_close(run(StreamingRestorer(net), clip, [3]), net(clip), rtol=0, atol=1e-5)
 
 
@@ -86,8 +75,8 @@ def test_attention_to_what_is_remembered_is_attention_to_the_frames():
 
 
 @torch.no_grad()
-def test_what_is_carried_keeps_its_size_and_stays_finite():
-    streaming, past = StreamingRestorer(trained(), horizon=5, remember=3), None
+def test_what_is_carried_keeps_its_size_and_stays_finite(trained):
+    streaming, past = StreamingRestorer(trained(CONFIG), horizon=5, remember=3), None
     past = streaming.nothing(1, 16, 16)
     shapes = [part.shape for part in past]
     for _ in range(40):

@@ -131,19 +131,17 @@ def _restorer(entrant: Entrant) -> Restore:
     if entrant.kind == "external":
         return lambda frames: _by_command(entrant.name, frames)
     from turbnet.deploy.method import ClassicalMethod
-    from turbnet.deploy.restore import OVERLAP, TILE, restore_frames
+    from turbnet.deploy.restore import restore_array
     from turbnet.deploy.session import Model
-    from turbnet.deploy.tiling import Tiling
     from turbnet.deploy.weights import find_model
 
     model: Model | ClassicalMethod
     model = ClassicalMethod(entrant.name) if entrant.kind == "method" else Model.load(find_model(entrant.name))
-    tiling = Tiling(TILE, OVERLAP, model.card.size_multiple)
 
     def restore(frames: Frames) -> Frames:
         if entrant.kind == "method" and len(frames) == 1:
             return frames  # a classical method needs more than one: it leaves a still as it is
-        return np.stack(list(restore_frames(frames, model, tiling, model.card.frames)))
+        return restore_array(frames, model)
 
     return restore
 

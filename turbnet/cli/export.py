@@ -31,8 +31,7 @@ def export(
     quiet: Annotated[bool, typer.Option("--quiet", help="no summary")] = False,
 ) -> int:
     """Write the network of a checkpoint as an ONNX file with its model card, proven against torch."""
-    from turbnet.deploy.checkpoint import card_of, load_network
-    from turbnet.deploy.checkpoint import streaming as go_frame_by_frame
+    from turbnet.deploy.checkpoint import card_of, frame_by_frame, load_network
     from turbnet.deploy.export import TOLERANCE, export_onnx
     from turbnet.deploy.session import Model
     from turbnet.errors import InputError, check_range
@@ -47,7 +46,7 @@ def export(
         frames = trained if isinstance(trained, int) else trained[-1]  # of a range the most
     card = card_of(network, hyper_parameters, int(check_range("frames", frames, 1, 1000)))
     if streaming:
-        network, card = go_frame_by_frame(network, card, horizon, remember)
+        network, card = frame_by_frame(network, card, horizon, remember)
     report = Report()
     for row in export_onnx(network, card, path):
         shape = "x".join(str(size) for size in row.shape)

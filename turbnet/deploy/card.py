@@ -120,6 +120,13 @@ class ModelCard(Card):
         low, high = self.data_range
         object.__setattr__(self, "data_range", (low, high))  # JSON knows lists only
 
+    def carried_shapes(self, batch: int, height: int, width: int) -> dict[str, tuple[int, ...]]:
+        """Shape of each part that is carried, for frames of this size."""
+        return {
+            name: (batch, *spec["shape"], height // spec["scale"], width // spec["scale"])
+            for name, spec in self.carried.items()
+        }
+
     def rows(self) -> list[tuple[str, Any]]:
         return [
             ("architecture", self.architecture),

@@ -50,7 +50,7 @@ def card_of(network: nn.Module, hyper_parameters: dict[str, Any], frames: int) -
     )
 
 
-def streaming(
+def frame_by_frame(
     network: nn.Module, card: ModelCard, horizon: float, remember: int
 ) -> tuple[StreamingRestorer, ModelCard]:
     """The same network frame by frame, and its card.

@@ -115,10 +115,7 @@ def _whole(module: nn.Module, frames_BTCHW: torch.Tensor, card: ModelCard) -> to
 
 
 def _nothing(card: ModelCard, batch: int, height: int, width: int) -> list[torch.Tensor]:
-    return [
-        torch.zeros(batch, *spec["shape"], height // spec["scale"], width // spec["scale"])
-        for spec in card.carried.values()
-    ]
+    return [torch.zeros(shape) for shape in card.carried_shapes(batch, height, width).values()]
 
 
 def flush_denormals(module: nn.Module) -> nn.Module:

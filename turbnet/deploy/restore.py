@@ -101,6 +101,34 @@ class FrameByFrame:
         return restored_BTCHW
 
 
+def ready(model: Model | ClassicalMethod, tiles: int) -> Model | ClassicalMethod | FrameByFrame:
+    """What `restore_frames` takes for one pass over a clip of so many tiles a frame; what is carried starts from nothing."""
+    return FrameByFrame(model, tiles) if isinstance(model, Model) and model.card.carried else model
+
+
+def tiling_of(model: Model | ClassicalMethod, tile: int = TILE, overlap: int | None = None) -> Tiling:
+    """How frames are cut for a model; overlap None: 32 pixels, or a quarter of a tile smaller than 128."""
+    return Tiling(tile, min(OVERLAP, tile // 4) if overlap is None else overlap, model.card.size_multiple)
+
+
+def window_of(model: Model | ClassicalMethod, window: int | None = None) -> int:
+    """Frames restored together; None: what the card recommends.
+
+    Raises:
+        InputError: out of range, or more than one of a model that goes frame by frame.
+    """
+    if model.card.carried and window not in (None, 1):
+        raise InputError(f"window = {window}: the model goes frame by frame")
+    return int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
+
+
+def restore_array(frames_THWC: np.ndarray, model: Model | ClassicalMethod) -> np.ndarray:
+    """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would."""
+    tiling = tiling_of(model)
+    network = ready(model, tiling.count(*frames_THWC.shape[1:3]))
+    return np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model))))
+
+
 def window_overlap(window: int) -> int:
     """Frames that successive windows share."""
     return window // 4
@@ -131,10 +159,7 @@ def restore_clip(
     Raises:
         InputError: the source cannot be read, the destination cannot be written, a parameter is out of range.
     """
-    tiling = Tiling(tile, min(OVERLAP, tile // 4) if overlap is None else overlap, model.card.size_multiple)
-    if model.card.carried and window not in (None, 1):
-        raise InputError(f"window = {window}: the model goes frame by frame")
-    window = int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
+    tiling, window = tiling_of(model, tile, overlap), window_of(model, window)
     passes = int(check_range("passes", passes, 1, 8))
     count, inside, start = 0, 0.0, time.perf_counter()
     with (
@@ -160,7 +185,7 @@ def restore_clip(
 
         frames: Iterable[np.ndarray] = clip
         for _ in range(passes):
-            whole = FrameByFrame(model, tiles) if isinstance(model, Model) and model.card.carried else model
+            whole = ready(model, tiles)
             frames = restore_frames(frames, partial(timed, whole=whole), tiling, window)
         for frame_HWC in frames:
             writer.write(frame_HWC)

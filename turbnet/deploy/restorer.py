@@ -6,17 +6,17 @@ clear = turbnet.Restorer()(frames)
 """
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from turbnet.deploy.restore import OVERLAP, TILE, FrameByFrame, Restoration, restore_clip, restore_frames
+from turbnet.deploy.restore import TILE, Restoration, ready, restore_clip, restore_frames, tiling_of, window_of
 from turbnet.deploy.session import Model
-from turbnet.deploy.tiling import Tiling
 from turbnet.deploy.weights import DEFAULT, find_model
-from turbnet.errors import InputError, check_range
+from turbnet.errors import InputError
 
 
 class Restorer:
@@ -36,11 +36,7 @@ class Restorer:
         self, model: str | Path = DEFAULT, threads: int | None = None, window: int | None = None, tile: int = TILE
     ) -> None:
         self.model = Model.load(find_model(model), threads)
-        if self.model.card.carried and window not in (None, 1):
-            raise InputError(f"window = {window}: the model goes frame by frame")
-        frames = self.model.card.frames if window is None else window
-        self.window = int(check_range("window", frames, 1, 1000, "frames"))
-        self.tiling = Tiling(tile, min(OVERLAP, tile // 4), self.model.card.size_multiple)
+        self.window, self.tiling = window_of(self.model, window), tiling_of(self.model, tile)
 
     def __call__(self, frames_THWC: NDArray[Any]) -> NDArray[Any]:
         """Restore a clip (T, H, W, 3) or a still (H, W, 3), RGB, sRGB-encoded; the same shape and dtype come back.
@@ -68,16 +64,12 @@ class Restorer:
                 dtype = frame.dtype
                 yield frame.astype(np.float32) / _full_scale(dtype)
 
-        source, network = floats(), self.model
-        run = network
-        if network.card.carried:
-            first = next(source, None)
-            if first is None:
-                return
-            tiles = self.tiling.count(*first.shape[:2])
-            run = FrameByFrame(network, tiles)  # type: ignore[assignment]
-            source = _again(first, source)
-        for restored in restore_frames(source, run, self.tiling, self.window):
+        source = floats()
+        first = next(source, None)
+        if first is None:
+            return
+        network = ready(self.model, self.tiling.count(*first.shape[:2]))
+        for restored in restore_frames(chain([first], source), network, self.tiling, self.window):
             assert dtype is not None
             full = _full_scale(dtype)
             yield restored.astype(dtype) if full == 1 else (restored * full + 0.5).astype(dtype)
@@ -93,8 +85,3 @@ def _full_scale(dtype: np.dtype[Any]) -> float:
     if np.issubdtype(dtype, np.floating):
         return 1.0
     raise InputError(f"frames of dtype {dtype}: give uint8, uint16 or floating point")
-
-
-def _again(first: NDArray[np.float32], rest: Iterator[NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-    yield first
-    yield from rest

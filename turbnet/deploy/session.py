@@ -84,10 +84,8 @@ class Model:
 
     def nothing(self, batch: int, height: int, width: int) -> Carried:
         """What is carried before the first frame."""
-        return {
-            name: np.zeros((batch, *spec["shape"], height // spec["scale"], width // spec["scale"]), np.float32)
-            for name, spec in self.card.carried.items()
-        }
+        shapes = self.card.carried_shapes(batch, height, width)
+        return {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
 
     def _run(self, frames_BTCHW: np.ndarray, carried: Carried) -> list[np.ndarray]:
         self._check(frames_BTCHW.shape)
