@@ -40,13 +40,14 @@ def main() -> int:
     options = parser.parse_args()
     try:
         rows = restorations(options)
+        table = {name: figures(clip) for name, clip in rows.items()}
     except InputError as error:
         print(f"contact_sheet: {error}", file=sys.stderr)
         return 2
     sheet(rows).save(options.output)
     print(f"| {options.clip.name} | jitter, pixels | flicker | sharpness | noise |\n|---|---|---|---|---|")
-    for name, clip in rows.items():
-        print(f"| {name} | {' | '.join(f'{value:.2g}' for value in figures(clip))} |")
+    for name, values in table.items():
+        print(f"| {name} | {' | '.join(f'{value:.2g}' for value in values)} |")
     return 0
 
 
