@@ -26,7 +26,7 @@ from turbnet.deploy.export import export_onnx, flush_denormals
 from turbnet.deploy.session import Model
 from turbnet.weights.released import DIGEST
 
-WINDOW = {"xs": 12, "s": 12, "m": 12}
+WINDOW = {"xs": 32, "s": 32, "m": 32}
 """Frames restored together, as recommended to users."""
 
 MEASURES = {

@@ -62,6 +62,24 @@ def test_the_tilt_map_takes_the_frames_to_the_blur_only_frames(scene):
     assert not torch.allclose(pair.blur_only, pair.target, atol=0.01)  # it is blurred
 
 
+@pytest.mark.parametrize("model", ["direct-to-image", "warp-blur"])
+def test_the_simple_models_stand_in_for_the_simulator(scene, model):
+    """The same contract: the true tilt takes the frames to the blur-only frames, and the camera points at the mean."""
+    pair = PairMaker(64, 64, d_over_r0=(2.0, 2.0), model=model, **SMALL, **SILENT)(scene, [3])
+    frames, truth, tilt = (x.flatten(0, 1) for x in (to_linear(pair.frames), to_linear(pair.blur_only), pair.tilt))
+    inner = (..., slice(8, -8), slice(8, -8))
+    before, after = ((x - truth)[inner].square().mean() for x in (frames, sample(frames, tilt)))
+    assert after < 0.15 * before
+    assert tilt.mean((0, 2, 3)).abs().max() < 0.3  # pixels; the grid reaches beyond the picture
+    again = PairMaker(64, 64, d_over_r0=(2.0, 2.0), model=model, **SMALL, **SILENT)(scene, [3])
+    assert torch.equal(again.frames, pair.frames)
+
+
+def test_no_such_model():
+    with pytest.raises(ParameterError, match="warp-blur"):
+        PairMaker(64, 64, model="cheap")
+
+
 def test_tilts_are_about_the_mean_aim(scene):
     """What all frames share is taken out; the grid reaches a little beyond the picture, so nearly."""
     pair = PairMaker(64, 64, d_over_r0=(3.0, 3.0), **SMALL)(scene, [4])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import turbnet
-from turbnet.deploy.restore import restore_frames
+from turbnet.deploy.restore import TILE, restore_frames
 from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError
 from turbnet.media.clip import read_clip, write_clip
@@ -25,7 +25,7 @@ def clip() -> np.ndarray:
 
 
 def test_a_clip_in_memory_is_what_restore_makes_of_it(restorer, clip):
-    expected = np.stack(list(restore_frames(clip, restorer.model, Tiling(384, 32, 4), 6)))
+    expected = np.stack(list(restore_frames(clip, restorer.model, Tiling(TILE, 32, 4), 6)))
     restored = restorer(clip)
     assert restored.dtype == np.float32
     np.testing.assert_array_equal(restored, expected)

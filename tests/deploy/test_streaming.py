@@ -48,7 +48,7 @@ def test_what_is_carried_is_that_of_torch(made, model):
         expected, *past = net(part, *past)
         restored, carried = model.step(part.numpy(), carried)
         np.testing.assert_allclose(restored, expected.numpy(), rtol=0, atol=1e-4)
-    assert list(carried) == ["reference", "memory", "pictures"]
+    assert list(carried) == ["reference", "recent", "memory", "dance", "pictures"]
     for mine, theirs in zip(carried.values(), past, strict=True):
         # Keys have unit length whatever they are made from, and values no bound, so rounding shows here more than in frames.
         np.testing.assert_allclose(mine, theirs.numpy(), rtol=0, atol=2e-3)
@@ -61,7 +61,9 @@ def test_the_sizes_of_the_file_have_names(made):
     assert sizes == {
         "frames": ["batch", "frames", 3, "height", "width"],
         "reference": ["batch", 4, "height", "width"],
+        "recent": ["batch", 4, "height/2", "width/2"],
         "memory": ["batch", 3, 33, "height/4", "width/4"],
+        "dance": ["batch", 4, "height/2", "width/2"],
         "pictures": ["batch", 3, 4, "height", "width"],
     }
 

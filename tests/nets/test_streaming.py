@@ -52,9 +52,11 @@ def test_a_restorer_without_learned_corrections_gathers_the_same_frame_by_frame_
     past = streaming.nothing(1, 16, 24)
     for frame in noisy.split(1, dim=1):
         _, *past = streaming(frame, *past)
-    reference, memory, pictures = past
+    reference, recent, memory, sums, pictures = past
     torch.testing.assert_close(reference[:, :-1], whole.registered.reference[:, 0], rtol=0, atol=1e-5)
     torch.testing.assert_close(reference[:, -1:], whole.registered.confidence.sum(1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(recent[:, -1:], torch.full_like(recent[:, -1:], 4.0))
+    torch.testing.assert_close(sums, whole.seen.dance, rtol=0, atol=1e-4)
     torch.testing.assert_close(pictures, whole.seen.pictures, rtol=0, atol=1e-4)
     torch.testing.assert_close(memory[:, :, 0], torch.ones_like(memory[:, :, 0]))
 

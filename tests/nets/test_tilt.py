@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from turbnet.data.pairs import PairMaker
 from turbnet.nets.blocks import warp
 from turbnet.nets.lucas_kanade import lucas_kanade
-from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, TiltNet, weighted_mean
+from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, TiltNet, neighbours, weighted_mean
 
 
 def trained(seed: int = 0) -> TiltNet:
@@ -32,12 +32,31 @@ def test_shapes(batch, frames, height, width):
 
 
 @torch.no_grad()
-def test_order_of_frames_does_not_matter():
-    net, clip = trained(), torch.rand(1, 5, 3, 24, 24)
-    order = torch.tensor([3, 0, 4, 1, 2])
-    out, mixed = net(clip), net(clip[:, order])
-    torch.testing.assert_close(mixed.frames, out.frames[:, order], rtol=0, atol=1e-4)
-    torch.testing.assert_close(mixed.tilts[-1], out.tilts[-1][:, order], rtol=0, atol=1e-3)
+def test_which_way_time_runs_does_not_matter():
+    net, clip = trained(), torch.rand(1, 7, 3, 24, 24)
+    out, reverse = net(clip), net(clip.flip(1))
+    torch.testing.assert_close(reverse.frames, out.frames.flip(1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(reverse.tilts[-1], out.tilts[-1].flip(1), rtol=0, atol=1e-3)
+
+
+@torch.no_grad()
+def test_the_drift_is_a_mean_over_five_frames_less_the_reference():
+    net, clip = TiltNet(widths=(4, 4, 4)), torch.rand(1, 7, 3, 16, 16)
+    out = net(clip)
+    half = F.avg_pool2d(out.frames[0], 2)
+    for frame, near in ((0, half[:3]), (3, half[1:6]), (6, half[4:])):
+        expected = near.mean(0) - F.avg_pool2d(out.reference[0], 2)[0]
+        torch.testing.assert_close(out.drift[0, frame], expected, rtol=0, atol=1e-6)
+
+
+@torch.no_grad()
+def test_frames_of_the_past_stand_in_for_those_missing():
+    clip = torch.rand(1, 7, 3, 4, 4)
+    whole = neighbours(clip)
+    recent = torch.cat((clip[:, 1:5].mean(1), torch.full((1, 1, 4, 4), 4.0)), dim=1)
+    # One frame and four of the past: those five, whose middle one is frame 3 of the whole.
+    torch.testing.assert_close(neighbours(clip[:, 5:6], recent)[:, 0], whole[:, 3], rtol=0, atol=1e-6)
+    torch.testing.assert_close(neighbours(clip[:, 5:], torch.zeros(1, 4, 4, 4)), neighbours(clip[:, 5:]))
 
 
 @torch.no_grad()

@@ -1,4 +1,6 @@
 import logging
+import os
+import signal
 
 import pytest
 import torch
@@ -6,7 +8,8 @@ from omegaconf import OmegaConf
 
 from turbnet.errors import InputError
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
-from turbnet.tasks.fit import check_targets, fit
+from turbnet.tasks.fit import _check_precision, check_targets, fit
+from turbnet.tasks.interruption import Interruption
 from turbnet.tasks.tilt import TiltRemoval
 
 
@@ -32,6 +35,38 @@ def test_a_run_leaves_what_it_says(stage_one, curve):
     rows = curve(stage_one)
     assert sum(bool(row["train/loss"]) for row in rows) == 4
     assert sum(bool(row["val/psnr"]) for row in rows) == 2
+
+
+class _Pressed(Interruption):
+    """Ctrl-C in the middle of the third step."""
+
+    finished = 0
+
+    def on_before_backward(self, trainer, module, loss):
+        if trainer.global_step == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def on_train_batch_end(self, *arguments):
+        type(self).finished += 1
+        super().on_train_batch_end(*arguments)
+
+
+def test_ctrl_c_ends_training_after_the_step_at_hand(tiny, tmp_path, monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("turbnet.tasks.fit.Interruption", _Pressed)
+    with pytest.raises(SystemExit):  # lightning makes one of it
+        fit(tiny(tmp_path / "run", "trainer.max_epochs=50"))
+    assert _Pressed.finished == 3
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+@pytest.mark.parametrize(("known", "precision"), [(True, "bf16-mixed"), (False, "32-true")])
+def test_bfloat16_is_for_processors_that_know_it(monkeypatch, capsys, known, precision):
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: known)
+    trainer = {"accelerator": "cpu", "precision": "bf16-mixed"}
+    _check_precision(trainer)
+    assert trainer["precision"] == precision
+    assert ("bfloat16" in capsys.readouterr().out) != known
 
 
 def test_a_checkpoint_holds_tensors_and_plain_values(stage_one):

@@ -56,8 +56,9 @@ def test_tilt_removal_learns_one_clip_by_heart(batch, weight):
 
 
 def test_restoration_learns_one_clip_by_heart(batch):
-    losses = learn(make(Restoration), batch, 100, 2e-3)
-    floor = 1e-3 + 0.01 * 0.1 + 0.2 * 1e-3
+    """The gate's loss, an entropy, has a floor that nobody knows: it is left out."""
+    losses = learn(make(Restoration, gate_weight=0.0), batch, 100, 2e-3)
+    floor = 1e-3 + 0.01 * 0.1 + 0.4 * 1e-3
     assert losses[-1] - floor < 0.5 * (losses[0] - floor)
 
 
@@ -69,6 +70,23 @@ def test_a_plain_unet_learns_one_clip_by_heart(batch):
     assert losses[-1] < 0.6 * losses[0]
     with pytest.raises(InputError, match="trains a Restorer; the network 'unet' is none"):
         TiltRemoval(net=net, simulator=SIMULATOR)
+
+
+@pytest.mark.parametrize("maps", [None, {"widths": [4, 6, 8], "depths": [1, 1, 1], "dropout": 0.1}])
+def test_a_still_restorer_learns_one_frame_by_heart_and_how_far_off_it_is(batch, maps):
+    net = {"name": "still", "widths": [8, 12, 16], "depths": [1, 1, 1], "maps": maps}
+    task = Restoration(net=net, simulator={**SIMULATOR, "d_over_r0": [3.0, 3.0]})
+    task.report = lambda *values: None
+    frame = {**batch, "scene": batch["scene"][:, :1]}
+    losses = learn(task, frame, 100, 2e-3)
+    assert losses[-1] < 0.6 * losses[0]
+    if maps:
+        found, pair = task.net.stages(task.pair(frame).frames).uncertainty, task.pair(frame)
+        blur, tilt = (float(x.abs().mean()) for x in (pair.target - pair.blur_only, pair.blur_only - pair.frames))
+        expected = found.maps.detach().mean((0, 1, 3, 4))
+        # It started at e^-3.5 for both; what it says now is of the order of what tilt and blur did to the frame.
+        assert 0.2 < float(expected[0] / tilt) < 2
+        assert 0.2 < float(expected[1] / blur) < 2
 
 
 @pytest.mark.parametrize("kind", [TiltRemoval, Restoration])

@@ -87,7 +87,7 @@ class TestAtTheTruth:
         zero = [torch.zeros_like(t[:, :, :1]) for t in exact]
 
         def loss(tilts, logits):
-            return float(tilt_loss(Registered(truth, tilts, logits, truth), truth))
+            return float(tilt_loss(Registered(truth, tilts, logits, truth, truth, truth), truth))
 
         assert loss(exact, zero) == pytest.approx(0.05 / 0.5, rel=1e-4)
         off = [t + 3 for t in exact]
@@ -102,7 +102,7 @@ class TestAtTheTruth:
     def test_tilt_error(self):
         truth = torch.randn(1, 3, 2, 32, 32)
         off = [F.avg_pool2d(truth[0], s)[None] + 2 for s in SCALES]
-        assert float(tilt_error(Registered(truth, off, [], truth), truth)) == pytest.approx(2, rel=1e-5)
+        assert float(tilt_error(Registered(truth, off, [], truth, truth, truth), truth)) == pytest.approx(2, rel=1e-5)
 
     def test_frequency_loss(self):
         """Of white noise of deviation s: each coefficient is complex normal, its mean modulus s sqrt(pi) / 2."""
@@ -125,25 +125,44 @@ def test_what_moves_counts_more():
     assert float(error) == pytest.approx(0.1 * (47 + 6) / 48, rel=1e-5)
 
 
-def gated(gate: float, own: float, scene: float) -> Restored:
+def gated(gate: float, own: tuple[float, float], scene: float) -> Restored:
     """What a restorer returns for a black clip of two frames if its parts are off by so much."""
     flat = torch.zeros(1, 2, 3, 8, 8)
-    nothing = Past(flat, flat, flat)
     logit = torch.full((1, 2, 1, 8, 8), gate)
-    return Restored(flat, flat[:, :1] + scene, flat + own, logit, Registered(flat, [], [], flat[:, :1]), nothing)
+    registered = Registered(flat, [], [], flat[:, :1], flat, flat)
+    errors = torch.tensor(own).view(1, 2, 1, 1, 1)
+    return Restored(flat, flat[:, :1] + scene, flat + errors, logit, registered, Past(flat, flat, flat, flat, flat))
 
 
-@pytest.mark.parametrize(("own", "scene", "share"), [(0.0, 0.0, 0.5), (0.1, 0.104, 0.881), (0.104, 0.1, 0.119)])
-def test_the_gate_wants_what_is_nearer(own, scene, share):
-    """The loss is least where the gate's value is sigmoid((e_scene - e_own) / 0.002)."""
+@pytest.mark.parametrize(
+    ("own", "scene", "share"), [((0.0, 0.12), 0.1, 0.1 / 0.12), ((0.1, 0.13), 0.11, 1 / 3), ((0.0, 0.2), 0.1, 0.5)]
+)
+def test_the_gate_wants_what_is_nearer_by_what_it_matters(own, scene, share):
+    """Of one gate for two frames, the first nearer by d_1, the second further off by d_2, the best is d_1 / (d_1 + d_2)."""
     logits = torch.linspace(-4, 4, 161)
     losses = torch.stack([gate_loss(gated(float(z), own, scene), torch.zeros(1, 2, 3, 8, 8)) for z in logits])
     best = torch.sigmoid(logits[losses.argmin()])
     assert float(best) == pytest.approx(share, abs=0.02)
 
 
+def test_the_gate_is_free_where_both_are_as_good():
+    made = gated(0.0, (0.1, 0.1), 0.1)
+    made.gate.requires_grad_()
+    gate_loss(made, torch.zeros(1, 2, 3, 8, 8)).backward()
+    assert made.gate.grad.abs().max() < 1e-6
+
+
+def test_the_gates_loss_of_a_batch_is_the_mean_of_its_clips():
+    """Or two processes would not take the step of one."""
+    clips = [gated(0.3, (0.0, 0.12), 0.1), gated(-0.5, (0.1, 0.4), 0.2)]
+    both = Restored(*(torch.cat(parts) for parts in list(zip(*clips, strict=True))[:4]), *clips[0][4:])
+    black = torch.zeros(1, 2, 3, 8, 8)
+    single = torch.stack([gate_loss(clip, black) for clip in clips]).mean()
+    torch.testing.assert_close(gate_loss(both, black.expand(2, -1, -1, -1, -1)), single)
+
+
 def test_the_gates_loss_moves_the_gate_alone():
-    made = gated(0.0, 0.1, 0.2)
+    made = gated(0.0, (0.1, 0.1), 0.2)
     parts = [part.requires_grad_() for part in (made.gate, made.own, made.scene)]
     gate_loss(made, torch.zeros(1, 2, 3, 8, 8)).backward()
     assert parts[0].grad.abs().sum() > 0

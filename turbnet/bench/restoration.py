@@ -2,7 +2,8 @@
 
 Every entrant runs in a process of its own, which also tells its peak memory; an outside command once a clip, on FFV1 files.
 PSNR and SSIM are means over the frames of a clip, 8 pixels of border left out; text is read by the built-in recogniser. An
-interval is that of the mean over scenes, 1.96 standard errors each way.
+interval is that of the mean over scenes, 1.96 standard errors each way. The entrant `bound` is the clean picture in the mean
+geometry of the clip's frames: the best that can be had from them.
 """
 
 import multiprocessing
@@ -29,7 +30,7 @@ BORDER = 8
 
 @dataclass(frozen=True)
 class Entrant:
-    """What restores: nothing, a classical method, a model (name or file), or a command with {in} and {out}."""
+    """What restores: nothing, the bound, a classical method, a model (name or file), or a command with {in} and {out}."""
 
     kind: str
     name: str
@@ -44,6 +45,7 @@ class Score:
     frames: int
     psnr: float
     ssim: float
+    psnr_settled: float = float("nan")
     psnr_moving: float = float("nan")
     psnr_still: float = float("nan")
     cer: float = float("nan")
@@ -60,7 +62,7 @@ class Result:
 
 
 def entrants(methods: Sequence[str], models: Sequence[str], commands: Sequence[str]) -> list[Entrant]:
-    """Those asked for, or else all classical methods and all released models; the input always comes first.
+    """Those asked for, or else all classical methods and all released models; input and bound always come first.
 
     Raises:
         InputError: an unknown method or model, a command without {in} or {out}.
@@ -79,7 +81,8 @@ def entrants(methods: Sequence[str], models: Sequence[str], commands: Sequence[s
         if "{in}" not in command or "{out}" not in command:
             raise InputError(f"--external {command!r}: say where the files go with {{in}} and {{out}}")
     kinds = (("method", methods), ("model", models), ("external", commands))
-    return [Entrant("input", "input"), *(Entrant(kind, name) for kind, those in kinds for name in those)]
+    always = [Entrant("input", "input"), Entrant("bound", "bound")]
+    return [*always, *(Entrant(kind, name) for kind, those in kinds for name in those)]
 
 
 def run(wanted: Sequence[Entrant], suite: str = "standard", quiet: bool = False) -> list[Result]:
@@ -127,9 +130,11 @@ def _work(entrant: Entrant, suite: str, sender: "multiprocessing.connection.Conn
 
 def _restorer(entrant: Entrant) -> Restore:
     if entrant.kind == "input":
-        return lambda frames: frames
+        return lambda clip: clip.frames
+    if entrant.kind == "bound":
+        return Clip.settled
     if entrant.kind == "external":
-        return lambda frames: _by_command(entrant.name, frames)
+        return lambda clip: _by_command(entrant.name, clip.frames)
     from turbnet.deploy.method import ClassicalMethod
     from turbnet.deploy.restore import restore_array
     from turbnet.deploy.session import Model
@@ -138,10 +143,10 @@ def _restorer(entrant: Entrant) -> Restore:
     model: Model | ClassicalMethod
     model = ClassicalMethod(entrant.name) if entrant.kind == "method" else Model.load(find_model(entrant.name))
 
-    def restore(frames: Frames) -> Frames:
-        if entrant.kind == "method" and len(frames) == 1:
-            return frames  # a classical method needs more than one: it leaves a still as it is
-        return restore_array(frames, model)
+    def restore(clip: Clip) -> Frames:
+        if entrant.kind == "method" and len(clip.frames) == 1:
+            return clip.frames  # a classical method needs more than one: it leaves a still as it is
+        return restore_array(clip.frames, model)
 
     return restore
 
@@ -172,7 +177,7 @@ def _score(restore: Restore, clip: Clip) -> Score:
     from turbnet.metrics.text import TextScore
 
     start = time.perf_counter()
-    restored = restore(clip.frames)
+    restored = restore(clip)
     seconds = time.perf_counter() - start
     inner = (slice(None), slice(BORDER, -BORDER), slice(BORDER, -BORDER))
     score = Score(
@@ -183,6 +188,8 @@ def _score(restore: Restore, clip: Clip) -> Score:
         float(np.mean(ssim(restored, clip.target, BORDER))),
         seconds=seconds,
     )
+    if clip.kind != "dynamic" and len(clip.frames) > 1:
+        score.psnr_settled = float(np.mean(psnr(restored, clip.settled(), BORDER)))
     if clip.kind == "dynamic":
         error, moving = ((restored - clip.target) ** 2).mean(-1)[inner], clip.moving[inner]
         score.psnr_moving = float(-10 * np.log10(error[moving].mean()))
@@ -206,6 +213,7 @@ def _mean(values: Iterable[float]) -> tuple[float, float]:
 FIGURES = {
     "PSNR": ("psnr", "dB"),
     "SSIM": ("ssim", ""),
+    "PSNR in the clip's mean geometry": ("psnr_settled", "dB"),
     "PSNR where it moves": ("psnr_moving", "dB"),
     "PSNR where it does not": ("psnr_still", "dB"),
     "character error rate": ("cer", ""),
@@ -240,9 +248,13 @@ def table(results: Sequence[Result]) -> str:
         for length in sorted({s.frames for s in results[0].scores}):
             own = [s for s in results[0].scores if s.kind == kind and s.frames == length]
             strengths = sorted({s.strength for s in own})
-            figures = {"static": ("psnr", "ssim"), "dynamic": ("psnr_moving", "psnr_still"), "text": ("psnr", "cer")}[
-                kind
-            ]
+            figures: tuple[str, ...] = {
+                "static": ("psnr", "ssim"),
+                "dynamic": ("psnr_moving", "psnr_still"),
+                "text": ("psnr", "cer"),
+            }[kind]
+            if kind == "static" and length > 1:
+                figures = ("psnr", "ssim", "psnr_settled")
             heads = [f"{_short(f)}, D/r0 = {s:g}" for s in strengths for f in figures]
             lines = [f"| {kind}, {length} frame{'s' if length > 1 else ''} | " + " | ".join(heads) + " |"]
             lines.append("|---" * (len(heads) + 1) + "|")
@@ -258,7 +270,14 @@ def table(results: Sequence[Result]) -> str:
 
 
 def _short(figure: str) -> str:
-    return {"psnr": "PSNR", "ssim": "SSIM", "psnr_moving": "moving", "psnr_still": "rest", "cer": "CER"}[figure]
+    return {
+        "psnr": "PSNR",
+        "ssim": "SSIM",
+        "psnr_settled": "settled",
+        "psnr_moving": "moving",
+        "psnr_still": "rest",
+        "cer": "CER",
+    }[figure]
 
 
 def _cell(result: Result, kind: str, length: int, strength: float, figure: str) -> str:
@@ -281,12 +300,12 @@ def draw_figure(results: Sequence[Result], path: Path) -> None:
         own = [s for s in result.scores if (s.kind, s.strength, s.frames) == ("static", middle, longest)]
         mean, half = _mean(s.psnr for s in own)
         milliseconds = 1e3 * sum(s.seconds for s in own) / sum(s.frames for s in own)
-        if result.entrant.kind == "input":
-            axes.axhline(mean, color="grey", linewidth=0.8)
+        if result.entrant.kind in ("input", "bound"):
+            axes.axhline(mean, color="grey", linewidth=0.8, linestyle="-" if result.entrant.kind == "input" else ":")
             continue
         axes.errorbar([milliseconds], [mean], [np.nan_to_num(half)], fmt="o", markersize=4, elinewidth=0.8)
         axes.annotate(result.entrant.name, (milliseconds, mean), (5, 3), textcoords="offset points", fontsize=7)
-    title = f"still scenes, D/r0 = {middle:g}, {longest} frames; grey: the input"
+    title = f"still scenes, D/r0 = {middle:g}, {longest} frames; grey: the input, dotted: the bound"
     axes.set(xscale="log", xlabel="time of a frame (ms)", ylabel="PSNR (dB)", title=title)
     axes.title.set_fontsize(9)
     axes.grid(alpha=0.3)

@@ -5,6 +5,10 @@ picture moves, and text. Each is seen at D/r0 = 1.5, 3 and 4.5 over the default 
 mean position, with shot noise of 20,000 electrons, read noise of 1 % and 8 bits; still scenes and text through frames of
 independent air, moving ones through air under a wind of 4 m/s at 30 frames a second. A clip of n frames is the first n
 of the longest.
+
+A clip of few frames has a mean tilt of its own, which no method can know: a picture without fault, seen in the clip's mean
+geometry, still scores less than infinity. `Clip.settled` is that picture: its PSNR bounds everybody's, and PSNR against it
+tells how good a restoration is but for the geometry.
 """
 
 from collections.abc import Callable
@@ -20,6 +24,7 @@ from turbnet.data.boxes import TextBox
 from turbnet.data.sources import embedded_paths, load_picture
 from turbnet.data.text_scenes import render_scene
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.nets.blocks import warp
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.simulator import Simulator
 
@@ -57,6 +62,7 @@ class Clip:
         target: the clean clip, (T, H, W, 3).
         moving: where something moves, (T, H, W).
         boxes: of text.
+        tilt: where each scene point went, (T, 2, H, W), pixels.
     """
 
     name: str
@@ -66,11 +72,19 @@ class Clip:
     target: Frames
     moving: NDArray[np.bool_]
     boxes: tuple[TextBox, ...]
+    tilt: Frames
 
     def first(self, count: int) -> "Clip":
         """The clip of its first frames."""
         cut = (self.frames[:count], self.target[:count], self.moving[:count])
-        return Clip(self.name, self.kind, self.strength, *cut, self.boxes)
+        return Clip(self.name, self.kind, self.strength, *cut, self.boxes, self.tilt[:count])
+
+    def settled(self) -> Frames:
+        """The clean clip in the mean geometry of its frames: what shows u in the scene shows u + mean t(u) there."""
+        clean = torch.from_numpy(self.target).permute(0, 3, 1, 2)
+        shift = torch.from_numpy(self.tilt).mean(0, keepdim=True)
+        # Tilts are smooth and a mean tilt is small: that of where a point arrives is that of where it came from.
+        return warp(clean, -shift.expand(len(clean), -1, -1, -1)).permute(0, 2, 3, 1).numpy()
 
 
 def names(suite: Suite) -> list[tuple[str, int, float]]:
@@ -90,10 +104,11 @@ def make_clip(kind: str, scene: int, strength: float, frames: int) -> Clip:
         # All moments at once, so that the camera points at the mean of the longest clip whatever is asked for.
         draw = simulator.draw([seed], max(LENGTHS), wind).centred()
         cut = type(draw)(draw.coefficients[:, :frames], draw.stride, draw.margin, draw.q)
-        seen = simulator(to_linear(clean[:1] if still else clean)[None], cut, seed).frames[0]
-        seen = (to_srgb(seen.clamp(0, 1)) * 255).round() / 255
+        seen = simulator(to_linear(clean[:1] if still else clean)[None], cut, seed)
+        shown = (to_srgb(seen.frames[0].clamp(0, 1)) * 255).round() / 255
     name = f"{kind} {scene + 1}, D/r0 = {strength:g}"
-    return Clip(name, kind, strength, seen.permute(0, 2, 3, 1).numpy(), target, moving, boxes)
+    frames_THWC = shown.permute(0, 2, 3, 1).numpy()
+    return Clip(name, kind, strength, frames_THWC, target, moving, boxes, seen.tilt[0].numpy())
 
 
 @lru_cache
@@ -135,5 +150,5 @@ def _text(scene: int, frames: int) -> tuple[Frames, NDArray[np.bool_], tuple[Tex
     return np.repeat(picture[None], frames, 0), np.zeros((frames, SIZE, SIZE), bool), tuple(drawn.boxes)
 
 
-Restore = Callable[[Frames], Frames]
-"""Frames (T, H, W, 3), sRGB in [0, 1], to as many restored ones."""
+Restore = Callable[[Clip], Frames]
+"""A clip to as many restored frames (T, H, W, 3), sRGB in [0, 1]."""

@@ -13,6 +13,7 @@ SUITES = {
     "physics": "optics, atmosphere and split-step against theory",
     "simulator": "the in-loop simulator: exactness, speed, run time against error",
     "restoration": "methods, models and commands over the frozen benchmark",
+    "maps": "uncertainty maps: calibration, and whether they rank errors",
 }
 
 
@@ -99,6 +100,24 @@ def restoration(
     if json is not None:
         bench.report(results).write(json)
     return 0
+
+
+def maps(
+    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="of a network with uncertainty maps")],
+    suite: Annotated[str, typer.Option(help="standard, or quick: one scene of each kind at one strength")] = "standard",
+    json: Annotated[Path | None, typer.Option(help="write the rows to this file")] = None,
+    figures: Annotated[Path | None, typer.Option(help="write reliability and sparsification into this folder")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
+) -> int:
+    """Restore single frames of the frozen benchmark and compare the errors with the maps."""
+    from turbnet.bench.suite import SUITES as suites
+    from turbnet.errors import InputError
+
+    _check_outputs(json, figures)
+    if suite not in suites:
+        raise InputError(f"there is no suite {suite}; the suites are {', '.join(suites)}")
+    bench = importlib.import_module("turbnet.bench.maps")
+    return _finish(bench, bench.run(checkpoint, suite, quiet), json, figures)
 
 
 def _check_outputs(json: Path | None, figures: Path | None) -> None:

@@ -27,7 +27,10 @@ def restore(
     passes: Annotated[
         int, typer.Option(help="how often; a second pass for blur stronger than one can undo, text above all")
     ] = 1,
-    tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 384,
+    skip: Annotated[
+        bool, typer.Option("--skip/--no-skip", help="leave out what needs no restoration or has not changed")
+    ] = False,
+    tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 320,
     threads: Annotated[int | None, typer.Option(help="processor threads; default: all cores")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar, no summary")] = False,
@@ -54,6 +57,7 @@ def restore(
         tile=tile,
         window=window,
         passes=passes,
+        skip=skip,
         quiet=quiet,
     )
     if json:
@@ -65,7 +69,10 @@ def restore(
         report.add(Row("tiles of a frame", done.tiles))
         report.add(Row("time a frame", done.milliseconds_a_frame, "ms"))
         report.add(Row("share of the network", done.network_seconds / done.seconds))
+        report.add(Row("tiles of windows that were clean", done.skipped.clean))
+        report.add(Row("tiles of windows that had not changed", done.skipped.still))
         report.write(json)
     if not quiet:
         frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
-        print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame")
+        spared = f", {done.skipped.saved:.0%} of the tiles skipped" if done.skipped.saved else ""
+        print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}")

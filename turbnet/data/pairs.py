@@ -9,10 +9,15 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
+from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import ParameterError, check_range
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.simulate.ranges import Conditions, Ranges
+from turbnet.simulate.simple import DirectToImage, WarpBlur
 from turbnet.simulate.simulator import Simulator
+
+SIMPLE = {"direct-to-image": DirectToImage, "warp-blur": WarpBlur}
+"""Simple models of turbulence that can stand in for the exact simulator."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class PairMaker(nn.Module):
     Args:
         height, width: of the clips, pixels.
         modes, stride, components, margin: of the simulators, one for each geometry.
+        model: zernike, the exact simulator; or one of the simple ones, direct-to-image and warp-blur, which know nothing of
+            modes, components and margin (`turbnet.simulate.simple`).
         ranges: fields of `turbnet.simulate.ranges.Ranges`.
 
     Raises:
@@ -52,14 +59,18 @@ class PairMaker(nn.Module):
         stride: int = 8,
         components: int = 8,
         margin: int | None = 8,
+        model: str = "zernike",
         **ranges: Any,
     ) -> None:
         super().__init__()
-        self.ranges = self.check(height, width, modes, stride, components, margin, **ranges)
-        self.simulators = nn.ModuleList(
-            Simulator(path, height, width, modes, stride, components, self.ranges.strengths, margin=margin)
-            for path in self.ranges.paths()
-        )
+        self.ranges = self.check(height, width, modes, stride, components, margin, model, **ranges)
+
+        def simulator(path: OpticalPath) -> nn.Module:
+            if model == "zernike":
+                return Simulator(path, height, width, modes, stride, components, self.ranges.strengths, margin=margin)
+            return SIMPLE[model](path, height, width, stride)
+
+        self.simulators = nn.ModuleList(simulator(path) for path in self.ranges.paths())
 
     @staticmethod
     def check(
@@ -69,6 +80,7 @@ class PairMaker(nn.Module):
         stride: int = 8,
         components: int = 8,
         margin: int | None = 8,
+        model: str = "zernike",
         **ranges: Any,
     ) -> Ranges:
         """The ranges of these arguments, the simulators not built; raises what the constructor raises."""
@@ -76,6 +88,8 @@ class PairMaker(nn.Module):
         for name, value in {**whole, "margin": margin or 0}.items():
             if not isinstance(value, int):
                 raise ParameterError(f"{name} = {value!r} must be a whole number")
+        if model != "zernike" and model not in SIMPLE:
+            raise ParameterError(f"there is no model {model!r} of turbulence; they are zernike, {', '.join(SIMPLE)}")
         return Ranges(**ranges)
 
     def conditions(self, seed: int, hardness: float = 1.0) -> Conditions:
@@ -95,7 +109,7 @@ class PairMaker(nn.Module):
         return Pair(to_srgb(frames.clamp(0, 1)), scene_BTCHW, to_srgb(blur_only.clamp(0, 1)), tilt)
 
     def _clip(self, scene_1TCHW: Tensor, seen_through: Conditions) -> tuple[Tensor, Tensor, Tensor]:
-        simulator = cast(Simulator, self.simulators[seen_through.geometry])
+        simulator = cast(Simulator | DirectToImage | WarpBlur, self.simulators[seen_through.geometry])
         wind = None if seen_through.wind is None else torch.tensor(seen_through.wind)
         strength = torch.tensor([seen_through.d_over_r0])
         draw = simulator.draw(

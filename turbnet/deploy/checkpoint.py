@@ -9,6 +9,7 @@ from torch import nn
 from turbnet.deploy.card import ModelCard
 from turbnet.errors import InputError
 from turbnet.nets import build
+from turbnet.nets.redegradation import Redegrading
 from turbnet.nets.restorer import Restorer
 from turbnet.nets.streaming import StreamingRestorer
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
@@ -16,6 +17,8 @@ from turbnet.tasks.checkpoint import load_net, read_checkpoint
 
 def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     """The network in a checkpoint, or a released one by name, ready to run, and the checkpoint's hyper-parameters.
+
+    Of a network that learned by re-degradation, the restorer: the rest has nothing to do any more.
 
     Raises:
         InputError: no file, no checkpoint, one of other software, or weights that do not fit the network it names.
@@ -29,6 +32,8 @@ def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         network.load_state_dict(load_net(path), strict=True)
     except RuntimeError as error:
         raise InputError(f"{path}: its weights do not fit the network it names ({error})") from error
+    if isinstance(network, Redegrading):
+        return network.restorer.eval(), {**hyper_parameters, "net": hyper_parameters["net"]["restorer"]}
     return network.eval(), hyper_parameters
 
 
@@ -64,11 +69,10 @@ def frame_by_frame(
     if not isinstance(network, Restorer):
         raise InputError(f"only a restorer goes frame by frame; {card.architecture} is none")
     wrapped = StreamingRestorer(network, horizon, remember)
-    patch = network.tcja.patch
+    scales = {"memory": network.tcja.patch, "recent": 2, "dance": 2}
     shapes = wrapped.nothing(1, card.size_multiple, card.size_multiple)
     carried = {
-        name: {"shape": list(part.shape[1:-2]), "scale": patch if name == "memory" else 1}
-        for name, part in shapes._asdict().items()
+        name: {"shape": list(part.shape[1:-2]), "scale": scales.get(name, 1)} for name, part in shapes._asdict().items()
     }
     notes = {"frame by frame": f"horizon {horizon:g} frames, keys and values of {remember}", **card.notes}
     return wrapped, replace(card, frames=1, notes=notes, carried=carried)

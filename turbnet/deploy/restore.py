@@ -10,13 +10,14 @@ import numpy as np
 
 from turbnet.deploy.method import ClassicalMethod
 from turbnet.deploy.session import Carried, Model
+from turbnet.deploy.skipping import Skipped, Skipping
 from turbnet.deploy.stream import stream, window_count
 from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
 from turbnet.progress import progress_bar
 
-TILE, OVERLAP = 384, 32
+TILE, OVERLAP = 320, 32
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Restoration:
         tiles: tiles of a frame.
         seconds: wall-clock time from the first frame read to the last one written.
         network_seconds: the part of it spent inside the network or the method.
+        skipped: what the network was spared.
     """
 
     frames: int
@@ -38,6 +40,7 @@ class Restoration:
     tiles: int
     seconds: float
     network_seconds: float
+    skipped: Skipped
 
     @property
     def milliseconds_a_frame(self) -> float:
@@ -70,8 +73,8 @@ def restore_frames(
                 raise InputError(f"frame {index} holds values that are not numbers (NaN or infinite); repair the clip")
             yield np.moveaxis(frame_HWC, -1, 0)
 
-    def restore_window(frames_TCHW: np.ndarray) -> np.ndarray:
-        return tiling.apply(network, frames_TCHW)
+    def restore_window(recent: list[np.ndarray]) -> np.ndarray:
+        return tiling.apply(network, recent)
 
     for index, restored_CHW in enumerate(stream(planes(), restore_window, window, window_overlap(window))):
         if not np.isfinite(restored_CHW).all():
@@ -101,9 +104,20 @@ class FrameByFrame:
         return restored_BTCHW
 
 
-def ready(model: Model | ClassicalMethod, tiles: int) -> Model | ClassicalMethod | FrameByFrame:
-    """What `restore_frames` takes for one pass over a clip of so many tiles a frame; what is carried starts from nothing."""
-    return FrameByFrame(model, tiles) if isinstance(model, Model) and model.card.carried else model
+Ready = Model | ClassicalMethod | FrameByFrame | Skipping
+
+
+def ready(model: Model | ClassicalMethod, tiles: int, skipped: Skipped | None = None) -> Ready:
+    """What `restore_frames` takes for one pass over a clip of so many tiles a frame; what is carried starts from nothing.
+
+    Args:
+        skipped: counts what a model that takes whole windows is spared; None: it is spared nothing.
+    """
+    if isinstance(model, ClassicalMethod):
+        return model
+    if model.card.carried:
+        return FrameByFrame(model, tiles)
+    return model if skipped is None else Skipping(model, tiles, skipped)
 
 
 def tiling_of(model: Model | ClassicalMethod, tile: int = TILE, overlap: int | None = None) -> Tiling:
@@ -122,10 +136,12 @@ def window_of(model: Model | ClassicalMethod, window: int | None = None) -> int:
     return int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
 
 
-def restore_array(frames_THWC: np.ndarray, model: Model | ClassicalMethod) -> np.ndarray:
+def restore_array(
+    frames_THWC: np.ndarray, model: Model | ClassicalMethod, skipped: Skipped | None = None
+) -> np.ndarray:
     """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would."""
     tiling = tiling_of(model)
-    network = ready(model, tiling.count(*frames_THWC.shape[1:3]))
+    network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped)
     return np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model))))
 
 
@@ -144,6 +160,7 @@ def restore_clip(
     overlap: int | None = None,
     window: int | None = None,
     passes: int = 1,
+    skip: bool = False,
     quiet: bool = True,
 ) -> Restoration:
     """Restore the clip in the file `source` into the file `destination`, which appears whole or not at all.
@@ -154,6 +171,7 @@ def restore_clip(
         overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
         window: frames restored together; None: what the model's card recommends, 50 for a classical method.
         passes: how often; a second pass restores what the first one left, for blur stronger than a network can undo at once.
+        skip: spare a model the tiles that need nothing, see `turbnet.deploy.skipping`.
         quiet: no progress bar on standard error.
 
     Raises:
@@ -161,7 +179,7 @@ def restore_clip(
     """
     tiling, window = tiling_of(model, tile, overlap), window_of(model, window)
     passes = int(check_range("passes", passes, 1, 8))
-    count, inside, start = 0, 0.0, time.perf_counter()
+    count, inside, start, skipped = 0, 0.0, time.perf_counter(), Skipped()
     with (
         open_clip(source, crop) as clip,
         open_writer(destination, fps=clip.info.fps, grey=clip.info.grey) as writer,
@@ -172,7 +190,7 @@ def restore_clip(
         windows = window_count(info.frames, window, window_overlap(window)) if info.frames else None
         task = progress.add_task("restoring", total=windows and windows * tiles * passes)
 
-        def timed(frames_BTCHW: np.ndarray, whole: Model | ClassicalMethod | FrameByFrame) -> np.ndarray:
+        def timed(frames_BTCHW: np.ndarray, whole: Ready) -> np.ndarray:
             nonlocal inside
             began = time.perf_counter()
             if isinstance(whole, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
@@ -185,10 +203,10 @@ def restore_clip(
 
         frames: Iterable[np.ndarray] = clip
         for _ in range(passes):
-            whole = ready(model, tiles)
+            whole = ready(model, tiles, skipped if skip else None)
             frames = restore_frames(frames, partial(timed, whole=whole), tiling, window)
         for frame_HWC in frames:
             writer.write(frame_HWC)
             count += 1
     seconds = time.perf_counter() - start
-    return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside)
+    return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside, skipped)

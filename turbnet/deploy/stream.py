@@ -10,7 +10,7 @@ from turbnet.errors import check_range
 
 
 def stream(
-    frames: Iterable[np.ndarray], restore: Callable[[np.ndarray], np.ndarray], window: int, overlap: int
+    frames: Iterable[np.ndarray], restore: Callable[[list[np.ndarray]], np.ndarray], window: int, overlap: int
 ) -> Iterator[np.ndarray]:
     """Restore frames through a sliding window; yield one frame for each that comes in, in order.
 
@@ -20,7 +20,7 @@ def stream(
 
     Args:
         frames: (C, H, W) each, float32.
-        restore: (T, C, H, W) -> (T, C', H, W), for any T up to `window`.
+        restore: T frames (C, H, W) -> (T, C', H, W), for any T up to `window`.
         window: frames restored together, >= 1.
         overlap: frames that successive windows share, 0 to window/2.
 
@@ -34,7 +34,7 @@ def stream(
     fresh = 0  # frames not restored yet
 
     def restore_recent() -> list[np.ndarray]:
-        restored = list(restore(np.stack(recent))[-(len(tail) + fresh) :])
+        restored = list(restore(list(recent))[-(len(tail) + fresh) :])
         for k, weight in enumerate(raised_cosine(len(tail)).astype(np.float32) if tail else ()):
             restored[k] = tail[k] + weight * (restored[k] - tail[k])
         return restored
@@ -44,7 +44,7 @@ def stream(
         fresh += 1
         if len(tail) + fresh == window:
             restored = restore_recent()
-            tail, fresh = restored[window - overlap :], 0
+            tail, fresh = [frame.copy() for frame in restored[window - overlap :]], 0  # or the whole window stays alive
             yield from restored[: window - overlap]
             del restored
     yield from restore_recent() if fresh else tail

@@ -8,7 +8,7 @@ Along each axis a tile's weight rises and falls as a raised cosine,
 whose mirror image is 1 - w, so neighbours' weights sum to one. A tile's weight is the product over both axes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil
 
@@ -87,29 +87,32 @@ class Tiling:
         rows, columns = self.axes(height, width)
         return len(rows.starts) * len(columns.starts)
 
-    def apply(self, network: Callable[[np.ndarray], np.ndarray], frames_TCHW: np.ndarray) -> np.ndarray:
+    def apply(
+        self, network: Callable[[np.ndarray], np.ndarray], frames: Sequence[np.ndarray] | np.ndarray
+    ) -> np.ndarray:
         """Pass frames of any size through `network`, (1, T, C, h, w) -> (1, T, C', h, w), tile by tile.
 
         Args:
-            frames_TCHW: float32; H and W at least 1.
+            frames: float32 (C, H, W) each, or all in one array; H and W at least 1. A window of many frames is large: it is
+                never copied as a whole.
 
         Returns:
             float32 (T, C', H, W).
         """
-        frames, _, height, width = frames_TCHW.shape
+        height, width = frames[0].shape[-2:]
         padding = [(0, self._padded(side) - side) for side in (height, width)]
-        padded_TCHW = frames_TCHW
-        if padding != [(0, 0), (0, 0)]:  # np.pad would copy the whole window
-            padded_TCHW = np.pad(frames_TCHW, [(0, 0), (0, 0), *padding], mode="reflect")
+        padded = list(frames)
+        if padding != [(0, 0), (0, 0)]:  # np.pad would copy
+            padded = [np.pad(frame, [(0, 0), *padding], mode="reflect") for frame in frames]
         rows, columns = self.axes(height, width)
 
         blended_TCHW: np.ndarray | None = None
         for top, weight_H in zip(rows.starts, rows.weights, strict=True):
             for left, weight_W in zip(columns.starts, columns.weights, strict=True):
-                place = np.s_[:, :, top : top + rows.length, left : left + columns.length]
-                (restored_TCHW,) = network(padded_TCHW[place][None])
+                place = np.s_[..., top : top + rows.length, left : left + columns.length]
+                (restored_TCHW,) = network(np.stack([frame[place] for frame in padded])[None])
                 if blended_TCHW is None:
-                    shape = (frames, restored_TCHW.shape[1], *padded_TCHW.shape[2:])
+                    shape = (len(padded), restored_TCHW.shape[1], *padded[0].shape[-2:])
                     blended_TCHW = np.zeros(shape, np.float32)
                 blended_TCHW[place] += restored_TCHW * np.outer(weight_H, weight_W).astype(np.float32)
         assert blended_TCHW is not None

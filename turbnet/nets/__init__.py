@@ -6,10 +6,19 @@ from typing import Any
 from torch import nn
 
 from turbnet.errors import InputError
+from turbnet.nets.dncnn import DnCNN
+from turbnet.nets.redegradation import Redegrading
 from turbnet.nets.restorer import Restorer
+from turbnet.nets.still import StillRestorer
 from turbnet.nets.unet import UNet
 
-NETS: dict[str, type[nn.Module]] = {"restorer": Restorer, "unet": UNet}
+NETS: dict[str, type[nn.Module]] = {
+    "restorer": Restorer,
+    "still": StillRestorer,
+    "redegrading": Redegrading,
+    "unet": UNet,
+    "dncnn": DnCNN,
+}
 """Every network that a config or a checkpoint can name."""
 
 

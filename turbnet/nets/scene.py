@@ -60,21 +60,70 @@ class LuckyFusion(nn.Module):
         return pictures.to(frames_BTCHW.dtype), torch.logsumexp(logits, dim=1)[:, :, None]
 
 
-class SceneNet(nn.Module):
-    """U-Net over half, a quarter and an eighth of the resolution; corrects the first of the pictures it is given.
+class UBody(nn.Module):
+    """U-Net over half, a quarter and an eighth of the resolution; its output starts at zero.
+
+    Args:
+        inner, outer: channels of input and output at full resolution.
+        known: channels of further features at a quarter of the resolution; 0: none.
+        widths: channels at the three scales.
+        depths: residual blocks at each scale, on the way down; on the way up as many but at the coarsest.
+    """
+
+    size_multiple = 8
+
+    def __init__(
+        self,
+        inner: int,
+        outer: int,
+        known: int = 0,
+        widths: Sequence[int] = (32, 64, 96),
+        depths: Sequence[int] = (1, 2, 4),
+    ) -> None:
+        super().__init__()
+        self.embed = conv3x3(4 * inner, widths[0])
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:], strict=False))
+        self.know = nn.Conv2d(known, widths[1], 1) if known else None
+        self.encode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths, depths, strict=True))
+        self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in zip(widths, widths[1:], strict=False))
+        self.decode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths[:-1], depths, strict=False))
+        self.correct = conv3x3(widths[0], 4 * outer)
+        zero_start(self.correct)
+
+    def forward(self, x_BCHW: Tensor, known_BCHW: Tensor | None = None, dropout: float = 0.0) -> Tensor:
+        """(B, outer, H, W); H and W multiples of `size_multiple`.
+
+        Args:
+            dropout: probability that a channel is dropped at each scale, whatever the mode.
+        """
+        x = self.embed(F.pixel_unshuffle(x_BCHW, 2))
+        passed = []
+        for scale, encode in enumerate(self.encode):
+            if scale:
+                passed.append(x)
+                x = self.down[scale - 1](x)
+            if scale == 1 and self.know is not None and known_BCHW is not None:
+                x = x + self.know(known_BCHW)
+            if dropout:
+                x = F.dropout2d(x, dropout, training=True)
+            x = encode(x)
+        for scale in reversed(range(len(passed))):
+            x = self.decode[scale](passed[scale] + F.pixel_shuffle(self.up[scale](x), 2))
+        return F.pixel_shuffle(self.correct(x), 2)
+
+
+class SceneNet(UBody):
+    """Corrects the first of the pictures it is given.
 
     The last of them can be blended in with weights of their own at every pixel: F_1 + sum_k a_k (P_k - F_1) + c.
 
     Args:
         inner: channels of all pictures.
-        known: channels of further features at a quarter of the resolution; 0: none.
-        widths: channels at the three scales.
-        depths: residual blocks at each scale, on the way down; on the way up as many but at the coarsest.
+        known, widths, depths: see `UBody`.
         channels: of the picture corrected.
         blends: pictures that are blended in.
+        hints: channels of maps that come with the pictures.
     """
-
-    size_multiple = 8
 
     def __init__(
         self,
@@ -84,32 +133,21 @@ class SceneNet(nn.Module):
         depths: Sequence[int] = (1, 2, 4),
         channels: int = 3,
         blends: int = 0,
+        hints: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(inner + hints, channels + blends, known, widths, depths)
         self.channels, self.blends = channels, blends
-        self.embed = conv3x3(4 * inner, widths[0])
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:], strict=False))
-        self.know = nn.Conv2d(known, widths[1], 1) if known else None
-        self.encode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths, depths, strict=True))
-        self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in zip(widths, widths[1:], strict=False))
-        self.decode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths[:-1], depths, strict=False))
-        self.correct = conv3x3(widths[0], 4 * (channels + blends))
-        zero_start(self.correct)
 
-    def forward(self, pictures_BCHW: Tensor, known_BCHW: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        pictures_BCHW: Tensor,
+        known_BCHW: Tensor | None = None,
+        dropout: float = 0.0,
+        hints_BCHW: Tensor | None = None,
+    ) -> Tensor:
         """(B, channels, H, W); H and W multiples of `size_multiple`."""
-        x = self.embed(F.pixel_unshuffle(pictures_BCHW, 2))
-        passed = []
-        for scale, encode in enumerate(self.encode):
-            if scale:
-                passed.append(x)
-                x = self.down[scale - 1](x)
-            if scale == 1 and self.know is not None and known_BCHW is not None:
-                x = x + self.know(known_BCHW)
-            x = encode(x)
-        for scale in reversed(range(len(passed))):
-            x = self.decode[scale](passed[scale] + F.pixel_shuffle(self.up[scale](x), 2))
-        first, change = pictures_BCHW[:, : self.channels], F.pixel_shuffle(self.correct(x), 2)
+        seen = pictures_BCHW if hints_BCHW is None else torch.cat((pictures_BCHW, hints_BCHW), dim=1)
+        first, change = pictures_BCHW[:, : self.channels], super().forward(seen, known_BCHW, dropout)
         out = first + change[:, : self.channels]
         if self.blends:
             others = pictures_BCHW[:, -self.blends * self.channels :].unflatten(1, (self.blends, self.channels))

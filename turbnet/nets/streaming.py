@@ -1,8 +1,8 @@
 r"""The restorer frame by frame: what it carries along is bounded, whatever the length of the clip.
 
-The same weights as in `Restorer`, used recurrently. Of the frames that have passed three things are kept: the reference they
-were registered to and the confidence behind it, keys and values of the last M for the TCJA transformer, the pictures of the
-lucky fusion and the weight behind them. Weights fade by
+The same weights as in `Restorer`, used recurrently. Of the frames that have passed five things are kept: the reference they
+were registered to and the confidence behind it, the mean of the last few, keys and values of the last M for the TCJA
+transformer, sums of their tilts, the pictures of the lucky fusion and the weight behind them. Weights fade by
 
 .. math::
     \lambda = 1 - \frac{1}{h}
@@ -44,20 +44,31 @@ class StreamingRestorer(nn.Module):
         patch = net.tcja.patch
         return Past(
             torch.zeros(batch, channels + 1, height, width),
+            torch.zeros(batch, channels + 1, height // 2, width // 2),
             torch.zeros(batch, self.remember, net.tcja.memory_channels, height // patch, width // patch),
+            torch.zeros(batch, 4, height // 2, width // 2),
             torch.zeros(batch, net.fusion.count, channels + 1, height, width),
         )
 
     def forward(
-        self, frames_BTCHW: Tensor, reference_BCHW: Tensor, memory_BMCHW: Tensor, pictures_BKCHW: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Restored frames (B, T, C, H, W), and the three parts of `Past` to come back with at the next frame."""
-        out = self.restorer.stages(frames_BTCHW, Past(reference_BCHW, memory_BMCHW, pictures_BKCHW))
-        reference, memory, pictures = out.seen
+        self,
+        frames_BTCHW: Tensor,
+        reference_BCHW: Tensor,
+        recent_BCHW: Tensor,
+        memory_BMCHW: Tensor,
+        dance_B4HW: Tensor,
+        pictures_BKCHW: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Restored frames (B, T, C, H, W), and the five parts of `Past` to come back with at the next frame."""
+        past = Past(reference_BCHW, recent_BCHW, memory_BMCHW, dance_B4HW, pictures_BKCHW)
+        out = self.restorer.stages(frames_BTCHW, past)
+        reference, recent, memory, dance, pictures = out.seen
         fade = math.log(self.fade) if self.fade > 0 else -math.inf
         return (
             out.frames,
             torch.cat((reference[:, :-1], self.fade * reference[:, -1:]), dim=1),
+            recent,
             torch.cat((memory_BMCHW, memory.float()), dim=1)[:, -self.remember :],
+            self.fade * dance,
             torch.cat((pictures[:, :, :-1], (pictures[:, :, -1:] + fade).clamp(min=0)), dim=2),
         )

@@ -12,6 +12,10 @@ The reference is the mean of the frames as registered so far, each weighted by i
 scene weighs little in it, and it sharpens from level to level. Nothing depends on the number of frames, and a reference
 made of earlier frames can take part in it.
 
+What moves of itself and what the air moves look alike in one frame; over a few frames they do not, for the air moves to and
+fro. So a level also sees the drift: the mean of the frames t - 2 .. t + 2, less the reference. It is small where only the
+air moves.
+
 After the tilt-removal stage of TMT (Zhang et al., IEEE TCI 2024), which supervises three scales with blur-only frames;
 here the reference is explicit, the first guess is computed and not learned, and the frame count is free.
 """
@@ -34,6 +38,12 @@ ERROR_AT_HALF = 0.5
 
 _LARGEST_LOGIT = 4.0
 
+_REACH = 2
+"""Frames on either side over which the drift is seen."""
+
+RECENT = 2 * _REACH + 1
+"""Frames of that mean."""
+
 
 class Registered(NamedTuple):
     """What tilt removal returns.
@@ -44,12 +54,16 @@ class Registered(NamedTuple):
             pixels.
         logits: z of the confidence at the same scales, each (B, T, 1, H/s, W/s).
         reference: mean of the registered frames by confidence, (B, 1, C, H, W).
+        neighbours: mean of each registered frame and its neighbours in time at half the resolution, (B, T, C, H/2, W/2).
+        drift: those less the reference.
     """
 
     frames: Tensor
     tilts: list[Tensor]
     logits: list[Tensor]
     reference: Tensor
+    neighbours: Tensor
+    drift: Tensor
 
     @property
     def confidence(self) -> Tensor:
@@ -64,7 +78,7 @@ class _Level(nn.Module):
         super().__init__()
         self.log_prior = nn.Parameter(torch.tensor(-7.0))
         self.layers = nn.Sequential(
-            conv3x3(2 * channels + 5, width),
+            conv3x3(3 * channels + 5, width),
             nn.ReLU(),
             conv3x3(width, width),
             nn.ReLU(),
@@ -79,11 +93,16 @@ class _Level(nn.Module):
         zero_start(self.certainty)
 
     def forward(
-        self, registered_NCHW: Tensor, reference_NCHW: Tensor, tilt_N2HW: Tensor, logit_N1HW: Tensor
+        self,
+        registered_NCHW: Tensor,
+        reference_NCHW: Tensor,
+        tilt_N2HW: Tensor,
+        logit_N1HW: Tensor,
+        drift_NCHW: Tensor,
     ) -> tuple[Tensor, Tensor]:
         step = lucas_kanade(registered_NCHW, reference_NCHW, self.log_prior.clamp(-12.0, 0.0).exp())
         step = step.to(registered_NCHW.dtype)
-        seen = torch.cat((registered_NCHW, reference_NCHW, tilt_N2HW, step, logit_N1HW), dim=1)
+        seen = torch.cat((registered_NCHW, reference_NCHW, tilt_N2HW, step, logit_N1HW, drift_NCHW), dim=1)
         features = self.layers(seen)
         moved = torch.sigmoid(self.gate(features)) * step + self.correction(features)
         return moved, logit_N1HW + self.certainty(features)
@@ -103,11 +122,14 @@ class TiltNet(nn.Module):
         super().__init__()
         self.levels = nn.ModuleList(_Level(channels, width) for width in widths)
 
-    def forward(self, frames_BTCHW: Tensor, past_BCHW: Tensor | None = None) -> Registered:
+    def forward(
+        self, frames_BTCHW: Tensor, past_BCHW: Tensor | None = None, recent_BCHW: Tensor | None = None
+    ) -> Registered:
         """The frames registered to each other and to what came before.
 
         Args:
             past_BCHW: the reference of earlier frames and the sum of their confidence, (B, C + 1, H, W).
+            recent_BCHW: the mean of the last few of them at half the resolution, and how many, (B, C + 1, H/2, W/2).
         """
         batch, count, _, height, width = frames_BTCHW.shape
         frames = frames_BTCHW.flatten(0, 1)
@@ -125,9 +147,11 @@ class TiltNet(nn.Module):
                 logit.unflatten(0, (batch, count)),
                 None if past_BCHW is None else F.avg_pool2d(past_BCHW, scale),
             )
-            everywhere = reference.expand(batch, count, *reference.shape[2:]).flatten(0, 1)
+            everywhere = reference.expand(batch, count, *reference.shape[2:])
+            recent = None if recent_BCHW is None else F.avg_pool2d(recent_BCHW, scale // 2)
+            drift = neighbours(registered.unflatten(0, (batch, count)), recent) - everywhere
             # Levels work in their own pixels, where a tilt is of order one.
-            moved, logit = level(registered, everywhere, tilt / scale, logit)
+            moved, logit = level(registered, everywhere.flatten(0, 1), tilt / scale, logit, drift.flatten(0, 1))
             tilt = tilt + scale * moved.to(tilt.dtype)
             logit = logit.to(tilt.dtype).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
             tilts.append(tilt)
@@ -135,7 +159,27 @@ class TiltNet(nn.Module):
         out = warp(frames, _enlarged(tilt, SCALES[-1])).unflatten(0, (batch, count))
         reference = weighted_mean(out, _enlarged(logit, SCALES[-1]).unflatten(0, (batch, count)), past_BCHW)
         tilts, logits = ([x.unflatten(0, (batch, count)) for x in xs] for xs in (tilts, logits))
-        return Registered(out, tilts, logits, reference)
+        half = neighbours(F.avg_pool2d(out.flatten(0, 1), 2).unflatten(0, (batch, count)), recent_BCHW)
+        drift = half - F.avg_pool2d(reference[:, 0], 2)[:, None]
+        return Registered(out, tilts, logits, reference, half, drift)
+
+
+def neighbours(frames_BTCHW: Tensor, recent_BCHW: Tensor | None = None) -> Tensor:
+    """Each frame's mean with its two neighbours on either side, as far as the clip goes, the same shape.
+
+    Args:
+        recent_BCHW: mean of the last frames of the past, and how many, (B, C + 1, H, W): stands in for those missing.
+    """
+    count = frames_BTCHW.shape[1]
+    sides = (0, 0, 0, 0, 0, 0, _REACH, _REACH)
+    padded, there = F.pad(frames_BTCHW, sides), F.pad(torch.ones_like(frames_BTCHW[:, :, :1]), sides)
+    total = sum(padded[:, shift : shift + count] for shift in range(1, RECENT)) + padded[:, :count]
+    number = sum(there[:, shift : shift + count] for shift in range(1, RECENT)) + there[:, :count]
+    if recent_BCHW is not None:
+        mean, earlier = recent_BCHW[:, None, :-1], recent_BCHW[:, None, -1:]
+        missing = torch.minimum(RECENT - number, earlier)
+        total, number = total + missing * mean, number + missing
+    return total / number
 
 
 def weighted_mean(frames_BTCHW: Tensor, logits_BT1HW: Tensor, past_BCHW: Tensor | None = None) -> Tensor:

@@ -18,7 +18,7 @@ which exists where the second moment of a diffraction-limited spot does not, and
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -62,6 +62,10 @@ class GaussianDraw:
     sigma: Tensor
     stride: int
     margin: int
+
+    def centred(self) -> "GaussianDraw":
+        """The same atmosphere seen by a camera that points at the clip's mean position: tilts sum to zero over a clip."""
+        return replace(self, tilt=self.tilt - self.tilt.mean(dim=(1, 3, 4), keepdim=True))
 
 
 @dataclass(frozen=True)

@@ -73,15 +73,19 @@ def frequency_loss(a: Tensor, b: Tensor) -> Tensor:
 
 
 def gate_loss(restored: Restored, target: Tensor) -> Tensor:
-    r"""Binary cross-entropy of the gate against which is nearer the target, the frame itself or the still scene.
+    r"""Cross-entropy of the gate against which is nearer the target, frame or still scene, by how much that matters:
 
-    The wanted gate is sigmoid((e_scene - e_own) / 0.002), e the absolute error, mean over 5 x 5 pixels and channels. Learned
-    from the restored frames alone a gate closes in the first steps, when the scene is the better everywhere, and stays so.
+    .. math::
+        \frac{\sum |e_S - e_O|\, \mathrm{BCE}(g, e_O < e_S)}{\sum |e_S - e_O|}
+
+    e the absolute error, mean over 9 x 9 pixels and channels. Where both are as good the label is chance, and counts little.
+    Learned from the restored frames alone a gate closes in the first steps, when the scene is the better everywhere.
     """
     with torch.no_grad():
         scene, own = (
-            F.avg_pool2d((x.float() - target.float()).abs().mean(2), 5, 1, 2, count_include_pad=False)
+            F.avg_pool2d((x.float() - target.float()).abs().mean(2), 9, 1, 4, count_include_pad=False)
             for x in (restored.scene, restored.own)
         )
-        wanted = torch.sigmoid((scene - own) / 0.002)[:, :, None]
-    return F.binary_cross_entropy_with_logits(restored.gate.float(), wanted)
+        gain = (scene - own)[:, :, None]
+        matters = gain.abs() / gain.abs().mean(dim=(1, 2, 3, 4), keepdim=True).clamp(min=1e-4)  # clips do not mix
+    return F.binary_cross_entropy_with_logits(restored.gate.float(), (gain > 0).float(), weight=matters)

@@ -1,0 +1,91 @@
+"""What a network is spared, on scenes whose turbulence is known."""
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+
+from turbnet.data.pairs import PairMaker
+from turbnet.deploy.restore import restore_frames
+from turbnet.deploy.skipping import STILL, Skipped, Skipping, dance
+from turbnet.deploy.tiling import Tiling
+
+SIZE = 96
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return (skimage.data.astronaut()[64 : 64 + SIZE, 160 : 160 + SIZE] / 255).astype(np.float32)
+
+
+def seen(scene, strength, frames, seed=0):
+    """(T, H, W, 3) through independent air with a camera's noise."""
+    ranges = {"d_over_r0": (strength, strength), "independent": 1.0, "read_noise": (0.01, 0.01), "full_well": 20_000.0}
+    clip = torch.from_numpy(scene).permute(2, 0, 1).expand(1, frames, 3, SIZE, SIZE)
+    return PairMaker(SIZE, SIZE, **ranges)(clip, [seed]).frames[0].permute(0, 2, 3, 1).numpy()
+
+
+def through(frames, skipped, window=12, network=lambda x: 0.5 * x):
+    return np.stack(list(restore_frames(frames, Skipping(network, 1, skipped), Tiling(128, 8, 8), window)))
+
+
+@pytest.mark.parametrize("strength", [1.0, 3.0])
+def test_the_dance_is_that_of_the_air(scene, strength):
+    """sqrt(0.4489) 4 / pi (D/r0)^(5/6) pixels; a picture bends, and blurs with it: within a third."""
+    expected = 0.853 * strength ** (5 / 6)
+    assert dance(seen(scene, strength, 12).mean(-1)) == pytest.approx(expected, rel=0.35)
+
+
+def test_noise_does_not_dance(scene):
+    assert dance(seen(scene, 0.0, 12).mean(-1)) < STILL
+    assert dance(np.repeat(scene.mean(-1)[None], 5, 0)) == 0
+    assert dance(np.full((4, 32, 32), 0.3)) == 0
+
+
+def test_what_moves_of_itself_does_not_dance(scene):
+    frames = np.repeat(scene.mean(-1)[None], 12, 0)
+    for number, frame in enumerate(frames):
+        frame[20:40, 10 + 4 * number : 30 + 4 * number] = 0.9
+    assert dance(frames) < STILL
+
+
+def test_a_clean_clip_passes_as_it_is(scene):
+    frames, skipped = seen(scene, 0.0, 20), Skipped()
+    np.testing.assert_allclose(through(frames, skipped), frames, atol=1e-6)
+    assert skipped.restored == skipped.still == 0
+    assert skipped.saved == 1
+
+
+def test_a_still_background_is_restored_once(scene):
+    frames, skipped = seen(scene, 2.0, 48), Skipped()
+    out = through(frames, skipped, network=lambda x: x.mean(1, keepdims=True).repeat(x.shape[1], 1))
+    assert (skipped.restored, skipped.clean, skipped.still) == (1, 0, 4)
+    np.testing.assert_allclose(out[-1], frames[:12].mean(0), atol=1e-5)
+
+
+@pytest.mark.parametrize("at", [10, 20, 30])
+def test_what_comes_into_the_scene_is_seen(scene, at):
+    """A shadow of 12 x 12 pixels, as strong as a block's mean may fluctuate: every window that shows it is restored."""
+    frames, skipped = seen(scene, 2.0, 48), Skipped()
+    frames[at : at + 6, 40:52, 30:42] *= 0.3
+    out = through(frames, skipped, network=lambda x: x)
+    shown = out[at + 1 : at + 5, 40:52, 30:42]
+    np.testing.assert_allclose(shown, frames[at + 1 : at + 5, 40:52, 30:42], atol=0.05)
+    assert skipped.restored >= 2
+
+
+def test_frames_alone_are_restored(scene):
+    skipped = Skipped()
+    np.testing.assert_allclose(through(scene[None], skipped), 0.5 * scene[None], atol=1e-6)
+    assert skipped == Skipped(restored=1)
+
+
+def test_tiles_keep_to_themselves(scene):
+    """Two tiles, of which only the left one dances."""
+    moving = seen(scene, 3.0, 16)
+    frames = np.concatenate((moving, np.repeat(scene[None], 16, 0)), axis=2)
+    tiling, skipped = Tiling(104, 16, 8), Skipped()
+    assert tiling.count(SIZE, 2 * SIZE) == 2
+    list(restore_frames(frames, Skipping(lambda x: x, 2, skipped), tiling, 8))
+    assert skipped.clean >= 1
+    assert skipped.restored >= 1

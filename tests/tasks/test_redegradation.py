@@ -1,0 +1,146 @@
+"""Re-degradation with and without ground truth, in seconds."""
+
+import pytest
+import skimage.data
+import torch
+from omegaconf import OmegaConf
+
+from turbnet.data.pairs import PairMaker
+from turbnet.deploy.checkpoint import load_network
+from turbnet.errors import InputError
+from turbnet.media.clip import write_clip
+from turbnet.nets.still import StillRestorer
+from turbnet.tasks.checkpoint import read_checkpoint
+from turbnet.tasks.finetune import Finetuning
+from turbnet.tasks.fit import fit
+from turbnet.tasks.redegradation import Redegradation
+
+RESTORER = {"name": "still", "widths": [8, 12, 16], "depths": [1, 1, 1]}
+SIMULATOR = {"height": 32, "width": 32, "modes": 10, "components": 3, "read_noise": [0.0, 0.0], "d_over_r0": [3.0, 3.0]}
+
+
+def make(kind, form="linear", **more):
+    torch.manual_seed(0)
+    net = {"name": "redegrading", "form": form, "restorer": RESTORER, "code": {"width": 8, "depth": 1}}
+    if form == "physical":
+        net["degradation"] = {"modes": 10, "components": 3}
+    task = kind(net=net, simulator=SIMULATOR, **more)
+    task.report = lambda stage, values, clips: task.__dict__.setdefault("seen", []).append(values)
+    return task
+
+
+@pytest.fixture
+def batch():
+    picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
+    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3]), "hardness": torch.tensor([1.0])}
+
+
+def learn(task, batch, steps, rate=2e-3):
+    optimiser = torch.optim.AdamW(list(task.trained()), lr=rate, betas=(0.9, 0.99))
+    losses = []
+    for _ in range(steps):
+        loss = task.training_step(batch, 0)
+        losses.append(float(loss.detach()))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return losses
+
+
+@pytest.mark.parametrize("form", ["linear", "physical"])
+def test_it_learns_one_clip_by_heart(form, batch):
+    task = make(Redegradation, form)
+    losses = learn(task, batch, 60)
+    assert losses[-1] < losses[0]
+    first, last = task.seen[0], task.seen[-1]
+    for name in ("charbonnier", "true_redegraded"):
+        assert last[name] < 0.9 * first[name], name
+
+
+@pytest.mark.parametrize("form", ["linear", "physical"])
+def test_without_truth_it_learns_to_give_what_was_seen(form, batch):
+    """A few steps on one clip: what was restored explains it better and by a likelier blur, and the old is not forgotten."""
+    task = make(Finetuning, form)
+    clip = {"scene": task.pair(batch).frames, "seed": batch["seed"], "hardness": batch["hardness"]}
+    learn(task, {"clips": clip, "scenes": batch}, 40)
+    first, last = task.seen[0], task.seen[-1]
+    for name in ("unsupervised", "old_charbonnier"):
+        assert last[name] < first[name], name
+    assert last["prior"] <= first["prior"]
+
+
+def test_values_and_networks_that_do_not_fit(batch):
+    with pytest.raises(InputError, match="trains a Redegrading"):
+        Redegradation(net=RESTORER, simulator=SIMULATOR)
+    with pytest.raises(InputError, match="no checkpoint"):
+        make(Redegradation, start_from="nowhere.ckpt")
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    """A folder with two short clips of still scenes."""
+    folder = tmp_path_factory.mktemp("clips")
+    maker = PairMaker(48, 48, d_over_r0=(4.0, 4.0), modes=10, components=3)
+    for number, top in enumerate((40, 200)):
+        picture = torch.from_numpy(skimage.data.astronaut()[top : top + 48, 100:148].copy()).float().permute(2, 0, 1)
+        frames = maker(picture.expand(1, 6, 3, 48, 48) / 255, [number]).frames[0]
+        write_clip(folder / f"{number}.mkv", frames.permute(0, 2, 3, 1).numpy())
+    return folder
+
+
+NET = (
+    "net=redegrading",
+    "net.form=linear",
+    "net.restorer.widths=[4,4,4]",
+    "net.restorer.depths=[1,1,1]",
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """fit(overrides...) of seconds; returns the folder."""
+    from hydra import compose, initialize_config_module
+
+    def go(name, *overrides):
+        folder = tmp_path_factory.mktemp(name)
+        small = ["threads=1", "callbacks=quiet", "data.size=32", "data.batch_size=2", "data.steps_per_epoch=2"]
+        small += ["data.val_clips=2", "trainer.max_epochs=2", "simulator.modes=10", "simulator.components=3"]
+        with initialize_config_module("turbnet.configs", version_base="1.3"):
+            fit(compose("train", overrides=[*small, *NET, f"output={folder}", *overrides]))
+        return folder
+
+    return go
+
+
+def test_pre_training_then_fine_tuning_as_a_user_does(run, clips):
+    first = run("first", "task=redegradation", "data.frames=3")
+    start = first / "checkpoints/last.ckpt"
+    more = ("task=finetune", "data=clips", f"data.clips=[{clips}]", "data.clip_frames=3", "data.frames=3")
+    tuned = run("tuned", *more, f"task.start_from={start}")
+    before, after = (read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"] for run in (first, tuned))
+    assert before.keys() == after.keys()
+    assert any(not torch.equal(before[name], after[name]) for name in before)
+    assert OmegaConf.load(tuned / "config.yaml").task.rehearsal_weight == 1.0
+    restorer, hyper = load_network(tuned / "checkpoints/last.ckpt")
+    assert isinstance(restorer, StillRestorer)  # to run and to export
+    assert hyper["net"]["name"] == "still"
+    again = run("again", *more, f"task.start_from={start}")
+    same = read_checkpoint(again / "checkpoints/last.ckpt")["state_dict"]
+    assert all(torch.equal(after[name], same[name]) for name in after)
+
+
+def test_a_restorer_alone_can_be_started_from(tmp_path):
+    state = {
+        f"net.{name}": torch.full_like(x, 0.5) for name, x in make(Redegradation).net.restorer.state_dict().items()
+    }
+    torch.save({"hyper_parameters": {"net": RESTORER}, "state_dict": state}, tmp_path / "restorer.ckpt")
+    task = make(Redegradation, start_from=str(tmp_path / "restorer.ckpt"))
+    assert all((x == 0.5).all() for x in task.net.restorer.state_dict().values())
+
+
+def test_clips_that_cannot_be_used(run, clips, tmp_path):
+    more = ("task=finetune", "data=clips", "task.start_from=null")
+    with pytest.raises(Exception, match="too few"):
+        run("long", *more, f"data.clips=[{clips}]", "data.clip_frames=40")
+    with pytest.raises(Exception, match="no clips"):
+        run("none", *more, f"data.clips=[{tmp_path}]")

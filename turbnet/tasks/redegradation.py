@@ -1,0 +1,74 @@
+"""Re-degradation with ground truth: restorer, code and degradation learn from simulated pairs."""
+
+from typing import Any
+
+from torch import Tensor
+
+from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.data.pairs import Pair
+from turbnet.nets.redegradation import Redegrading
+from turbnet.tasks.checkpoint import load_net, read_checkpoint
+from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, tilt_error, tilt_loss
+from turbnet.tasks.simulated import SimulatedTask
+
+
+class Redegradation(SimulatedTask):
+    """Trains all of `Redegrading`: the restored frames are compared with the clean clip, the clean clip degraded by the code
+    of the frames, and the restored frames so degraded, with the frames, the code's tilt with the true one.
+
+    Args:
+        frequency_weight, redegradation_weight, tilt_weight: of the frequency loss, of both distances to the frames, of the
+            tilt's likelihood.
+        start_from: checkpoint of the same network, or of its restorer alone, to start from; or a released network's name.
+        more: see `SimulatedTask`.
+    """
+
+    trains = (Redegrading,)
+
+    def __init__(
+        self,
+        frequency_weight: float = 0.1,
+        redegradation_weight: float = 0.5,
+        tilt_weight: float = 0.01,
+        start_from: str | None = None,
+        **more: Any,
+    ) -> None:
+        super().__init__(
+            frequency_weight=frequency_weight,
+            redegradation_weight=redegradation_weight,
+            tilt_weight=tilt_weight,
+            **more,
+        )
+        if start_from is not None:
+            whole = read_checkpoint(start_from)["hyper_parameters"]["net"].get("name") == self.hparams["net"]["name"]
+            part = self.net if whole else self.net.restorer
+            part.load_state_dict(
+                load_net(start_from, self.hparams["net"] if whole else self.hparams["net"]["restorer"])
+            )
+
+    def supervised(self, pair: Pair) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        """Loss of a pair, what it is made of, the restored frames."""
+        net, weight = self.net, self.hparams["redegradation_weight"]
+        restored, code = net.restorer(pair.frames), net.code(pair.frames)
+        distance = charbonnier(restored, pair.target)
+        truly = charbonnier(net.degradation(pair.target, code), pair.frames)
+        again = charbonnier(net.degradation(restored, code), pair.frames)
+        loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
+        loss = loss + weight * (truly + again)
+        values = {"charbonnier": distance, "true_redegraded": truly, "redegraded": again}
+        if pair.frames.shape[1] > 1:
+            registered = net.code.tilt(pair.frames)
+            loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
+            values["tilt_px"] = tilt_error(registered, pair.tilt)
+        return loss, values, restored
+
+    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
+        pair = self.pair(batch)
+        loss, values, restored = self.supervised(pair)
+        values["loss"] = loss
+        if stage == "val":
+            values["psnr"] = psnr(restored, pair.target)
+            values["psnr_input"] = psnr(pair.frames, pair.target)
+            values["psnr_redegraded"] = psnr(self.net.stages(pair.frames).frames, pair.frames)
+        self.report(stage, values, len(pair.frames))
+        return loss
