@@ -58,7 +58,7 @@ def test_unknown_entrants_are_refused(asked, complaint):
 
 def test_everybody_takes_part_unless_told_otherwise():
     names = [entrant.name for entrant in entrants((), (), ())]
-    assert names[:2] == ["input", "bound"]
+    assert names[:2] == ["input", "settled"]
     assert {"pipeline", "mean", "s"} <= set(names)
 
 

@@ -2,8 +2,8 @@
 
 Every entrant runs in a process of its own, which also tells its peak memory; an outside command once a clip, on FFV1 files.
 PSNR and SSIM are means over the frames of a clip, 8 pixels of border left out; text is read by the built-in recogniser. An
-interval is that of the mean over scenes, 1.96 standard errors each way. The entrant `bound` is the clean picture in the mean
-geometry of the clip's frames: the best that can be had from them.
+interval is that of the mean over scenes, 1.96 standard errors each way. The entrant `settled` is the clean picture in the
+mean geometry of the clip's frames: without fault but for what they cannot tell.
 """
 
 import multiprocessing
@@ -30,7 +30,7 @@ BORDER = 8
 
 @dataclass(frozen=True)
 class Entrant:
-    """What restores: nothing, the bound, a classical method, a model (name or file), or a command with {in} and {out}."""
+    """What restores: nothing, the settled scene, a classical method, a model (name or file), or a command with {in}, {out}."""
 
     kind: str
     name: str
@@ -62,7 +62,7 @@ class Result:
 
 
 def entrants(methods: Sequence[str], models: Sequence[str], commands: Sequence[str]) -> list[Entrant]:
-    """Those asked for, or else all classical methods and all released models; input and bound always come first.
+    """Those asked for, or else all classical methods and all released models; input and settled scene always come first.
 
     Raises:
         InputError: an unknown method or model, a command without {in} or {out}.
@@ -81,7 +81,7 @@ def entrants(methods: Sequence[str], models: Sequence[str], commands: Sequence[s
         if "{in}" not in command or "{out}" not in command:
             raise InputError(f"--external {command!r}: say where the files go with {{in}} and {{out}}")
     kinds = (("method", methods), ("model", models), ("external", commands))
-    always = [Entrant("input", "input"), Entrant("bound", "bound")]
+    always = [Entrant("input", "input"), Entrant("settled", "settled")]
     return [*always, *(Entrant(kind, name) for kind, those in kinds for name in those)]
 
 
@@ -131,7 +131,7 @@ def _work(entrant: Entrant, suite: str, sender: "multiprocessing.connection.Conn
 def _restorer(entrant: Entrant) -> Restore:
     if entrant.kind == "input":
         return lambda clip: clip.frames
-    if entrant.kind == "bound":
+    if entrant.kind == "settled":
         return Clip.settled
     if entrant.kind == "external":
         return lambda clip: _by_command(entrant.name, clip.frames)
@@ -300,12 +300,12 @@ def draw_figure(results: Sequence[Result], path: Path) -> None:
         own = [s for s in result.scores if (s.kind, s.strength, s.frames) == ("static", middle, longest)]
         mean, half = _mean(s.psnr for s in own)
         milliseconds = 1e3 * sum(s.seconds for s in own) / sum(s.frames for s in own)
-        if result.entrant.kind in ("input", "bound"):
+        if result.entrant.kind in ("input", "settled"):
             axes.axhline(mean, color="grey", linewidth=0.8, linestyle="-" if result.entrant.kind == "input" else ":")
             continue
         axes.errorbar([milliseconds], [mean], [np.nan_to_num(half)], fmt="o", markersize=4, elinewidth=0.8)
         axes.annotate(result.entrant.name, (milliseconds, mean), (5, 3), textcoords="offset points", fontsize=7)
-    title = f"still scenes, D/r0 = {middle:g}, {longest} frames; grey: the input, dotted: the bound"
+    title = f"still scenes, D/r0 = {middle:g}, {longest} frames; grey: the input, dotted: settled"
     axes.set(xscale="log", xlabel="time of a frame (ms)", ylabel="PSNR (dB)", title=title)
     axes.title.set_fontsize(9)
     axes.grid(alpha=0.3)

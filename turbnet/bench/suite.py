@@ -7,8 +7,8 @@ independent air, moving ones through air under a wind of 4 m/s at 30 frames a se
 of the longest.
 
 A clip of few frames has a mean tilt of its own, which no method can know: a picture without fault, seen in the clip's mean
-geometry, still scores less than infinity. `Clip.settled` is that picture: its PSNR bounds everybody's, and PSNR against it
-tells how good a restoration is but for the geometry.
+geometry, still scores less than infinity. `Clip.settled` is that picture: PSNR against it tells how good a restoration is
+but for the geometry. Its own PSNR is no strict bound: blurring what is uncertain scores a little more where little is known.
 """
 
 from collections.abc import Callable
