@@ -30,7 +30,7 @@ BORDER = 8
 
 @dataclass(frozen=True)
 class Entrant:
-    """What restores: nothing, the settled scene, a classical method, a model (name or file), or a command with {in}, {out}."""
+    """What restores: nothing, the settled scene, a classical method, a model (name or file), a command with {in}, {out}."""
 
     kind: str
     name: str
