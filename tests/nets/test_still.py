@@ -16,17 +16,6 @@ SMALL = {"name": "still", "widths": [4, 6, 8], "depths": [1, 1, 1]}
 MAPS = {"widths": [4, 6, 8], "depths": [1, 1, 1], "dropout": 0.2}
 
 
-def trained(config: dict) -> torch.nn.Module:
-    """A net whose every weight takes part, as after training."""
-    torch.manual_seed(0)
-    net = build(config)
-    with torch.no_grad():
-        for parameter in net.parameters():
-            if not parameter.any():
-                parameter.normal_(std=0.1)
-    return net.eval()
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("config", [SMALL, {**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}])
 @pytest.mark.parametrize(("batch", "frames", "height", "width"), [(1, 1, 8, 8), (2, 3, 24, 40)])
@@ -37,13 +26,13 @@ def test_untrained_they_give_back_the_frames(config, batch, frames, height, widt
 
 @torch.no_grad()
 @pytest.mark.parametrize("config", [{**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}])
-def test_every_frame_is_restored_by_itself(config):
+def test_every_frame_is_restored_by_itself(trained, config):
     net, clip = trained(config), torch.rand(2, 3, 3, 16, 24)
     torch.testing.assert_close(net(clip)[1:, 2:], net(clip[1:, 2:]), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("config", [SMALL, {**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}])
-def test_every_weight_learns(config):
+def test_every_weight_learns(trained, config):
     net = trained(config)
     net(torch.rand(1, 2, 3, 16, 16)).square().mean().backward()
     for name, parameter in net.named_parameters():
@@ -53,7 +42,7 @@ def test_every_weight_learns(config):
 
 
 @torch.no_grad()
-def test_scales_are_bounded_whatever_comes_in():
+def test_scales_are_bounded_whatever_comes_in(trained):
     net = trained({**SMALL, "maps": MAPS}).maps
     for clip in (torch.zeros(1, 1, 3, 16, 16), torch.ones(1, 1, 3, 16, 16), 1e4 * torch.randn(1, 1, 3, 16, 16)):
         found = net(clip)
@@ -64,7 +53,7 @@ def test_scales_are_bounded_whatever_comes_in():
 
 
 @torch.no_grad()
-def test_dropout_is_for_training_and_monte_carlo():
+def test_dropout_is_for_training_and_monte_carlo(trained):
     net, clip = trained({**SMALL, "maps": MAPS}).maps, torch.rand(1, 2, 3, 16, 16)
     assert torch.equal(net(clip).change, net(clip).change)
     assert not torch.equal(net(clip, drop=True).change, net(clip, drop=True).change)
@@ -72,7 +61,7 @@ def test_dropout_is_for_training_and_monte_carlo():
 
 
 @torch.no_grad()
-def test_monte_carlo_adds_the_spread_of_its_passes():
+def test_monte_carlo_adds_the_spread_of_its_passes(trained):
     """One pass says b; several say b^2 + Var / 2, of which the first part is that of a single pass on the average."""
     torch.manual_seed(0)
     net, clip = trained({**SMALL, "maps": MAPS}).maps, torch.rand(1, 1, 3, 16, 16)

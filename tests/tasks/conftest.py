@@ -3,6 +3,7 @@
 import csv
 
 import pytest
+import skimage.data
 import torch
 from hydra import compose, initialize_config_module
 
@@ -83,3 +84,10 @@ def curve():
 def stage_one(train, tmp_path_factory):
     """The folder of a run of tilt removal."""
     return train(tmp_path_factory.mktemp("stage_one"), "task=tilt")
+
+
+@pytest.fixture
+def batch():
+    """A still scene of four frames."""
+    picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
+    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3]), "hardness": torch.tensor([1.0])}

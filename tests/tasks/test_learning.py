@@ -1,7 +1,6 @@
 """Tasks on one batch, without a trainer."""
 
 import pytest
-import skimage.data
 import torch
 import torch.nn.functional as F
 
@@ -21,12 +20,6 @@ def make(kind, d_over_r0=(3.0, 3.0), **more):
     task = kind(net=NET, simulator={**SIMULATOR, "d_over_r0": list(d_over_r0)}, **more)
     task.report = lambda *values: None  # there is no trainer to log to
     return task
-
-
-@pytest.fixture
-def batch():
-    picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
-    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3]), "hardness": torch.tensor([1.0])}
 
 
 def learn(task, batch, steps, rate):

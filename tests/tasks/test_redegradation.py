@@ -29,12 +29,6 @@ def make(kind, form="linear", **more):
     return task
 
 
-@pytest.fixture
-def batch():
-    picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
-    return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3]), "hardness": torch.tensor([1.0])}
-
-
 def learn(task, batch, steps, rate=2e-3):
     optimiser = torch.optim.AdamW(list(task.trained()), lr=rate, betas=(0.9, 0.99))
     losses = []

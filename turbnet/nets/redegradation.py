@@ -33,7 +33,7 @@ from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import ParameterError, check_range
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.nets.blocks import ResidualBlock, conv3x3, warp, zero_start
-from turbnet.nets.tilt import TiltNet
+from turbnet.nets.tilt import Registered, TiltNet
 from turbnet.simulate.draw import TILT_PIXELS, Draw
 from turbnet.simulate.simple import STRONGEST, short_exposure_sigma
 from turbnet.simulate.simulator import Simulator
@@ -98,10 +98,14 @@ class CodeNet(nn.Module):
         self.head = nn.Conv2d(3 * width, size, 1)
         zero_start(self.head)
 
-    def forward(self, frames_BTCHW: Tensor) -> Code:
-        """The code of each frame; a frame alone has no tilt."""
+    def forward(self, frames_BTCHW: Tensor, registered: Registered | None = None) -> Code:
+        """The code of each frame; a frame alone has no tilt.
+
+        Args:
+            registered: what `self.tilt` made of the frames, where that is known already.
+        """
         batch, frames = frames_BTCHW.shape[:2]
-        found = self.tilt(frames_BTCHW).tilts[-1].flatten(0, 1)
+        found = (registered or self.tilt(frames_BTCHW)).tilts[-1].flatten(0, 1)
         x = self.first(self.embed(F.pixel_unshuffle(frames_BTCHW.flatten(0, 1), 4)))
         blur = self.head(self.blocks(self.further(self.second(self.down(x)))))
         cells = F.avg_pool2d(found.float(), CELL // 2)

@@ -105,19 +105,18 @@ class Restorer(nn.Module):
         pictures, weight = self.fusion(registered.frames, features, confidence, earlier)
         sharpened = self.inverse(pictures[:, 0])
         sums = _sums(registered.tilts[-1], past)
-        scene = self.scene(torch.cat((pictures, sharpened), dim=1).flatten(1, 2), gathered, hints_BCHW=dance(sums))[
-            :, None
-        ]
+        seen = torch.cat((pictures, sharpened), dim=1).flatten(1, 2)
+        scene = self.scene(seen, gathered, hints_BCHW=dance(sums))[:, None]
         own, gate = self.own(frames_BTCHW, registered.frames, scene, registered.drift, features)
         total = confidence.sum(1) if past is None else confidence.sum(1) + past.reference[:, -1:]
-        seen = Past(
+        carried = Past(
             torch.cat((registered.reference[:, 0], total), dim=1),
             _recent(registered.neighbours, past),
             memory,
             sums,
             torch.cat((pictures, (weight - _NO_WEIGHT).clamp(min=0)), dim=2),
         )
-        return Restored(scene + torch.sigmoid(gate) * (own - scene), scene, own, gate, registered, seen)
+        return Restored(scene + torch.sigmoid(gate) * (own - scene), scene, own, gate, registered, carried)
 
     def forward(self, frames_BTCHW: Tensor) -> Tensor:
         """Restored frames (B, T, C, H, W), sRGB-encoded in [0, 1] like the input; H and W multiples of `size_multiple`."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from turbnet.nets.blocks import each_frame
 from turbnet.nets.inverse import InverseFilters
 from turbnet.nets.scene import SceneNet
-from turbnet.nets.uncertainty import Uncertainty, UncertaintyNet
+from turbnet.nets.uncertainty import LEAST, MOST, Uncertainty, UncertaintyNet
 
 
 class StillRestored(NamedTuple):
@@ -48,7 +48,7 @@ class StillRestorer(nn.Module):
         parts = [frames_BTCHW]
         if expected is not None:
             # Logarithms in 0 to 1, so that small errors count, and what is expected to change.
-            parts.append((expected.log_scale.to(frames_BTCHW.dtype) + 7) / 7)
+            parts.append(((expected.log_scale - LEAST) / (MOST - LEAST)).to(frames_BTCHW.dtype))
             parts.append(expected.change.flatten(2, 3).to(frames_BTCHW.dtype))
         parts.append(each_frame(lambda x: self.inverse(x).flatten(1, 2), frames_BTCHW))
         return StillRestored(each_frame(self.net, torch.cat(parts, dim=2)), expected)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.data.pairs import Pair
-from turbnet.nets.redegradation import Redegrading
+from turbnet.nets.redegradation import Redegraded, Redegrading
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
 from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
@@ -46,29 +46,30 @@ class Redegradation(SimulatedTask):
                 load_net(start_from, self.hparams["net"] if whole else self.hparams["net"]["restorer"])
             )
 
-    def supervised(self, pair: Pair) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-        """Loss of a pair, what it is made of, the restored frames."""
+    def supervised(self, pair: Pair) -> tuple[Tensor, dict[str, Tensor], Redegraded]:
+        """Loss of a pair, what it is made of, what the network found."""
         net, weight = self.net, self.hparams["redegradation_weight"]
-        restored, code = net.restorer(pair.frames), net.code(pair.frames)
+        registered = net.code.tilt(pair.frames)
+        restored, code = net.restorer(pair.frames), net.code(pair.frames, registered)
+        found = Redegraded(restored, code, net.degradation(restored, code))
         distance = charbonnier(restored, pair.target)
         truly = charbonnier(net.degradation(pair.target, code), pair.frames)
-        again = charbonnier(net.degradation(restored, code), pair.frames)
+        again = charbonnier(found.frames, pair.frames)
         loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
         loss = loss + weight * (truly + again)
         values = {"charbonnier": distance, "true_redegraded": truly, "redegraded": again}
         if pair.frames.shape[1] > 1:
-            registered = net.code.tilt(pair.frames)
             loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
             values["tilt_px"] = tilt_error(registered, pair.tilt)
-        return loss, values, restored
+        return loss, values, found
 
     def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         pair = self.pair(batch)
-        loss, values, restored = self.supervised(pair)
+        loss, values, found = self.supervised(pair)
         values["loss"] = loss
         if stage == "val":
-            values["psnr"] = psnr(restored, pair.target)
+            values["psnr"] = psnr(found.restored, pair.target)
             values["psnr_input"] = psnr(pair.frames, pair.target)
-            values["psnr_redegraded"] = psnr(self.net.stages(pair.frames).frames, pair.frames)
+            values["psnr_redegraded"] = psnr(found.frames, pair.frames)
         self.report(stage, values, len(pair.frames))
         return loss
