@@ -14,10 +14,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import torch
+from onnxscript import opset18
 from torch import nn
 
 from turbnet.deploy.card import Card, ModelCard
@@ -145,12 +147,23 @@ def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
                 dynamic_shapes=(free, *sides),
                 external_data=False,
                 verbose=False,
+                custom_translation_table={torch.ops.aten.pixel_unshuffle.default: _pixel_unshuffle},
             )
     except torch.onnx.OnnxExporterError as error:
         cause = error.__cause__ or error
         raise InputError(f"cannot export {card.architecture}: {str(cause).strip().splitlines()[0]}") from error
     assert program is not None
     return program.model_proto
+
+
+def _pixel_unshuffle(self: Any, downscale_factor: int) -> Any:
+    """Blocks before channels, then whole planes put in order: half the time of the exporter's transpose of six axes."""
+    op: Any = opset18  # whose types know nothing of symbols
+    blocks = op.SpaceToDepth(self, blocksize=downscale_factor)
+    sides = op.Shape(blocks, start=2)
+    apart = op.Concat(op.Constant(value_ints=[0, downscale_factor**2, -1]), sides, axis=0)
+    planes = op.Transpose(op.Reshape(blocks, apart), perm=[0, 2, 1, 3, 4])
+    return op.Reshape(planes, op.Concat(op.Constant(value_ints=[0, -1]), sides, axis=0))
 
 
 @contextmanager

@@ -51,13 +51,17 @@ class LuckyFusion(nn.Module):
         logits = logits.unflatten(0, features_BTCHW.shape[:2]) + confidence_BT1HW.float().clamp(min=1e-4).log()
         if past_BKCHW is not None:
             logits = torch.cat((past_BKCHW[:, None, :, -1], logits), dim=1)
-        weights = torch.softmax(logits, dim=1)
+        # Not softmax: onnxruntime transposes for any axis but the last.
+        peak = logits.amax(1, keepdim=True)
+        weights = (logits - peak).exp()
+        total = weights.sum(1)
         now = weights[:, -frames_BTCHW.shape[1] :]
         fused = [(now[:, :, k : k + 1] * frames_BTCHW).sum(1) for k in range(self.count)]
         pictures = torch.stack(fused, dim=1)
         if past_BKCHW is not None:
             pictures = pictures + weights[:, 0, :, None] * past_BKCHW[:, :, :-1]
-        return pictures.to(frames_BTCHW.dtype), torch.logsumexp(logits, dim=1)[:, :, None]
+        pictures = pictures / total[:, :, None]
+        return pictures.to(frames_BTCHW.dtype), (peak[:, 0] + total.log())[:, :, None]
 
 
 class UBody(nn.Module):
