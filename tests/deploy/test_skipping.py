@@ -74,6 +74,27 @@ def test_what_comes_into_the_scene_is_seen(scene, at):
     assert skipped.restored >= 2
 
 
+@pytest.mark.parametrize("corner", [(0, 0), (80, 80), (40, 0)])
+def test_only_what_changes_is_restored_again(scene, corner):
+    """Something flickers in one place all the time: the network sees that place and what surrounds it, no more."""
+    frames, skipped, sizes = seen(scene, 2.0, 48), Skipped(), []
+    place = np.s_[:, corner[0] : corner[0] + 16, corner[1] : corner[1] + 16]
+    frames[place] = np.random.default_rng(0).random((48, 1, 1, 1), np.float32)
+
+    def network(x):
+        sizes.append(x.shape[3:])
+        assert all(side % 8 == 0 for side in x.shape[3:])
+        return x
+
+    out = through(frames, skipped, network=network)
+    assert sizes[0] == (SIZE, SIZE)
+    assert all(height * width < SIZE * SIZE for height, width in sizes[1:])
+    assert skipped.restored < 1 + 4 * 80 * 80 / SIZE**2
+    np.testing.assert_allclose(out[place], frames[place], atol=1e-6)
+    far = np.s_[12:, (corner[0] + 48) % SIZE, (corner[1] + 48) % SIZE]
+    assert np.ptp(out[far], axis=0).max() < 1e-6  # restored once
+
+
 def test_frames_alone_are_restored(scene):
     skipped = Skipped()
     np.testing.assert_allclose(through(scene[None], skipped), 0.5 * scene[None], atol=1e-6)

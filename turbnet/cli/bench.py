@@ -14,6 +14,8 @@ SUITES = {
     "simulator": "the in-loop simulator: exactness, speed, run time against error",
     "restoration": "methods, models and commands over the frozen benchmark",
     "maps": "uncertainty maps: calibration, and whether they rank errors",
+    "deployment": "released networks on this machine: speed, memory, what --skip saves and loses",
+    "all": "physics, simulator, restoration and deployment, on one page",
 }
 
 
@@ -27,7 +29,7 @@ def main(arguments: list[str]) -> int:
     if suite not in SUITES:
         print(f"turbnet bench: there is no suite {suite!r}; the suites are {', '.join(SUITES)}", file=sys.stderr)
         return 2
-    return run_typed(globals()[suite], arguments[1:], f"bench {suite}")
+    return run_typed(everything if suite == "all" else globals()[suite], arguments[1:], f"bench {suite}")
 
 
 def physics(
@@ -118,6 +120,48 @@ def maps(
         raise InputError(f"there is no suite {suite}; the suites are {', '.join(suites)}")
     bench = importlib.import_module("turbnet.bench.maps")
     return _finish(bench, bench.run(checkpoint, suite, quiet), json, figures)
+
+
+def deployment(
+    model: Annotated[list[str] | None, typer.Option(help="released network or ONNX file; may be given again")] = None,
+    only: Annotated[
+        str | None, typer.Option(help="families to measure, of speed,skip,start,memory; comma-separated")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="write the rows to this file")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="short clips, no memory: a minute or two")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
+) -> int:
+    """Measure what restoring costs, with all released networks or with those that are named."""
+    from turbnet.deploy.weights import released_models
+    from turbnet.errors import InputError
+
+    _check_outputs(json, None)
+    bench = importlib.import_module("turbnet.bench.deployment")
+    families = bench.FAMILIES if only is None else tuple(only.split(","))
+    unknown = [name for name in families if name not in bench.FAMILIES]
+    if unknown:
+        raise InputError(f"--only {only}: there is no family {unknown[0]!r}; they are {', '.join(bench.FAMILIES)}")
+    report = bench.run(model or list(released_models()), families, quick, quiet)
+    print(bench.table(report))
+    if json is not None:
+        report.write(json)
+    return 0
+
+
+def everything(
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder of the page, its figures and the rows")],
+    quick: Annotated[bool, typer.Option("--quick", help="fewer draws and clips: some minutes")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
+) -> int:
+    """Measure all of it and write bench.md, bench.json and figures into a folder; exit code 1 if a row misses."""
+    from turbnet.errors import InputError
+
+    if output.exists() and not output.is_dir():
+        raise InputError(f"cannot write into {output}: it is a file; name a folder")
+    output.mkdir(parents=True, exist_ok=True)
+    report = importlib.import_module("turbnet.bench.page").write(output, quick, quiet)
+    print(output / "bench.md")
+    return 0 if report.ok else 1
 
 
 def _check_outputs(json: Path | None, figures: Path | None) -> None:

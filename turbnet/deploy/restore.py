@@ -117,7 +117,7 @@ def ready(model: Model | ClassicalMethod, tiles: int, skipped: Skipped | None = 
         return model
     if model.card.carried:
         return FrameByFrame(model, tiles)
-    return model if skipped is None else Skipping(model, tiles, skipped)
+    return model if skipped is None else Skipping(model, tiles, skipped, model.card.size_multiple)
 
 
 def tiling_of(model: Model | ClassicalMethod, tile: int = TILE, overlap: int | None = None) -> Tiling:

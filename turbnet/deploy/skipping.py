@@ -9,8 +9,10 @@ alike. From the pixels of the strongest and of the weakest gradients,
 with v the variance over time; medians, so that what moves of itself does not count. Below a tenth of a pixel, D/r0 = 0.08,
 there is nothing to restore and the frames pass as they are.
 
-**Nothing has changed.** A still background is restored once. If the means over blocks of 16 x 16 pixels are, all through a
-window, what they were in the one before, as far as they fluctuate, what was restored then stands for the whole window.
+**Nothing has changed.** A still background is restored once. Where the means over blocks of 16 x 16 pixels are, all through
+a window, what they were when the block was last restored, as far as they fluctuate, what was restored then stands for the
+whole window. The network sees the smallest rectangle around the other blocks, with 32 pixels around it, over which the new
+fades into the old.
 """
 
 from collections.abc import Callable
@@ -18,11 +20,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from turbnet.deploy.tiling import raised_cosine
+
 STILL = 0.1
 """RMS displacement, pixels, below which air does not matter."""
 
 _LOOKED_AT = 12  # frames of a window, equally spaced
 _BLOCK = 16
+_AROUND = 32  # pixels of context around what has changed
 _CHANGE = 0.012  # of a block's mean, full scale 1: three steps of eight bits
 _FLUCTUATION = 5.0  # standard errors
 _QUIET = 0.75 / 255  # RMS: the last bit of eight
@@ -30,11 +35,11 @@ _QUIET = 0.75 / 255  # RMS: the last bit of eight
 
 @dataclass
 class Skipped:
-    """Tiles of windows: `clean` passed as they were, `still` given what was restored before, `restored` went through."""
+    """Tiles of windows, or parts of one: `clean` passed as they were, `still` given what was restored before, `restored`."""
 
-    clean: int = 0
-    still: int = 0
-    restored: int = 0
+    clean: float = 0.0
+    still: float = 0.0
+    restored: float = 0.0
 
     @property
     def saved(self) -> float:
@@ -43,10 +48,13 @@ class Skipped:
         return (self.clean + self.still) / total if total else 0.0
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Kept:
+    """What was restored, by block: its mean and fluctuation then, and whether it stood still; the picture (C, H, W)."""
+
     means: np.ndarray
     spread: np.ndarray
+    steady: np.ndarray
     picture: np.ndarray
 
 
@@ -57,10 +65,13 @@ class Skipping:
         network: (1, T, C, h, w) -> (1, T, C, h, w).
         tiles: of a frame.
         skipped: counts what was spared.
+        multiple: sides the network accepts are multiples of this, pixels.
     """
 
-    def __init__(self, network: Callable[[np.ndarray], np.ndarray], tiles: int, skipped: Skipped) -> None:
-        self._network, self.skipped = network, skipped
+    def __init__(
+        self, network: Callable[[np.ndarray], np.ndarray], tiles: int, skipped: Skipped, multiple: int = 8
+    ) -> None:
+        self._network, self.skipped, self._multiple = network, skipped, multiple
         self._kept: list[_Kept | None] = [None] * tiles
         self._turn = 0
 
@@ -68,24 +79,68 @@ class Skipping:
         """The next tile's frames restored."""
         turn, self._turn = self._turn, (self._turn + 1) % len(self._kept)
         frames = frames_BTCHW[0]
-        if len(frames) > 1:
-            looked = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))].mean(1)
-            if dance(looked) < STILL:
-                self._kept[turn] = None
-                self.skipped.clean += 1
-                return frames_BTCHW
-            means, spread = _blocks(looked)
-            kept = self._kept[turn]
-            if kept is not None and _same(kept.means, np.minimum(kept.spread, spread), means):
-                self.skipped.still += 1
-                return np.repeat(kept.picture[:, None], len(frames), axis=1)
-        restored = self._network(frames_BTCHW)
-        self.skipped.restored += 1
-        if len(frames) > 1:
-            # Only what stood still all the time stands for what comes.
-            steady = _same(means.mean(0), spread, means)
-            self._kept[turn] = _Kept(means.mean(0), spread, restored.mean(1)) if steady else None
-        return restored
+        if len(frames) == 1:
+            self.skipped.restored += 1
+            return self._network(frames_BTCHW)
+        looked = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))].mean(1)
+        moved = dance(looked)
+        if moved < STILL:
+            self._kept[turn] = None
+            self.skipped.clean += 1
+            return frames_BTCHW
+        means, spread = _blocks(looked)
+        # Only what stands still all the time stands for what comes; air moves no edge further than it dances.
+        calm = spread < _CHANGE + moved / _BLOCK
+        now = _Kept(means.mean(0), spread, calm & _same(means.mean(0), spread, means), frames[0])
+        kept = self._kept[turn]
+        whole = (slice(0, frames.shape[2]), slice(0, frames.shape[3]))
+        box = whole
+        if kept is not None:
+            known = calm & kept.steady & _same(kept.means, np.minimum(kept.spread, spread), means)
+            box = self._around(~known, *frames.shape[2:]) if not known.all() else (slice(0, 0), slice(0, 0))
+        share = (box[0].stop - box[0].start) * (box[1].stop - box[1].start) / (frames.shape[2] * frames.shape[3])
+        self.skipped.restored += share
+        self.skipped.still += 1 - share
+        if kept is None or box == whole:
+            restored = self._network(frames_BTCHW)
+            now.picture = restored.mean(1)[0]
+            self._kept[turn] = now
+            return restored
+        out = np.repeat(kept.picture[None, None], len(frames), axis=1)
+        if share:
+            fresh = self._network(np.ascontiguousarray(frames_BTCHW[..., box[0], box[1]]))
+            weight = np.outer(*(_fade(part, side) for part, side in zip(box, frames.shape[2:], strict=True)))
+            place = out[..., box[0], box[1]]
+            place += weight.astype(np.float32) * (fresh - place)
+            kept.picture = kept.picture.copy()
+            kept.picture[:, box[0], box[1]] = place.mean(1)[0]
+            for name in ("means", "spread", "steady"):
+                setattr(kept, name, np.where(known, getattr(kept, name), getattr(now, name)))
+        return out
+
+    def _around(self, changed_hw: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
+        """The rectangle around the blocks that have changed, a multiple of what the network takes."""
+        parts = []
+        for axis, side in ((1, height), (0, width)):
+            where = np.flatnonzero(changed_hw.any(axis))
+            starts = _starts(side)
+            end = starts[where[-1] + 1] if where[-1] + 1 < len(starts) else side
+            first = max(starts[where[0]] - _AROUND, 0) // self._multiple * self._multiple
+            length = -(-(min(end + _AROUND, side) - first) // self._multiple) * self._multiple
+            length = min(max(length, 4 * self._multiple), side)
+            first = min(first, side - length)
+            parts.append(slice(first, first + length))
+        return parts[0], parts[1]
+
+
+def _fade(part: slice, side: int) -> np.ndarray:
+    """Weights of what is new along one axis: it fades in over half of what surrounds it, but for the tile's own border."""
+    weights, ramp = np.ones(part.stop - part.start), raised_cosine(_AROUND // 2)
+    if part.start > 0:
+        weights[: len(ramp)] = ramp
+    if part.stop < side:
+        weights[-len(ramp) :] = ramp[::-1]
+    return weights
 
 
 def dance(frames_THW: np.ndarray) -> float:
@@ -112,24 +167,31 @@ def dance(frames_THW: np.ndarray) -> float:
     return float(np.sqrt(max(moved, 0.0) / np.median(steepness[steepness >= strong])))
 
 
+def _starts(side: int) -> list[int]:
+    """Where blocks begin along an axis; the last one takes what is left."""
+    return list(range(0, max(side - _BLOCK, 0) + 1, _BLOCK))
+
+
 def _blocks(frames_THW: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Means of blocks of every frame, (T, h, w), and how much they fluctuate, (h, w).
 
     The standard deviation, from the median difference of successive frames: what comes and goes makes a few of them large.
     """
-    frames, height, width = frames_THW.shape
-    size = min(_BLOCK, height, width)
-    rows, columns = height // size, width // size
-    cut = frames_THW[:, : rows * size, : columns * size].reshape(frames, rows, size, columns, size)
-    means = cut.mean((2, 4))
+    sums, count = frames_THW.astype(np.float64), np.ones(())
+    for axis in (1, 2):
+        starts = _starts(frames_THW.shape[axis])
+        sums = np.add.reduceat(sums, starts, axis=axis)
+        lengths = np.diff([*starts, frames_THW.shape[axis]])
+        count = np.multiply.outer(count, lengths)
+    means = sums / count
     return means, np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.954
 
 
-def _same(expected: np.ndarray, spread: np.ndarray, means: np.ndarray) -> bool:
-    """Whether a window, and its first and its last third, show what is expected, so that nothing passes through."""
-    third = max(len(means) // 3, 1)
-    for part in (means, means[:third], means[-third:]):
-        allowed = _CHANGE + _FLUCTUATION * spread / np.sqrt(len(part))
-        if (np.abs(part.mean(0) - expected) > allowed).any():
-            return False
-    return True
+def _same(expected_hw: np.ndarray, spread_hw: np.ndarray, means_Thw: np.ndarray) -> np.ndarray:
+    """Where a window, its first and last third show what is expected, so that nothing passes through: (h, w)."""
+    third = max(len(means_Thw) // 3, 1)
+    same = np.ones(expected_hw.shape, bool)
+    for part in (means_Thw, means_Thw[:third], means_Thw[-third:]):
+        allowed = _CHANGE + _FLUCTUATION * spread_hw / np.sqrt(len(part))
+        same &= np.abs(part.mean(0) - expected_hw) <= allowed
+    return same
