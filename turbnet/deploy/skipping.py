@@ -11,8 +11,8 @@ there is nothing to restore and the frames pass as they are.
 
 **Nothing has changed.** A still background is restored once. Where the means over blocks of 16 x 16 pixels are, all through
 a window, what they were when the block was last restored, as far as they fluctuate, what was restored then stands for the
-whole window. The network sees the smallest rectangle around the other blocks, with 32 pixels around it, over which the new
-fades into the old.
+whole window. The network sees rectangles around the other blocks, with 32 pixels around them, over which the new fades
+into the old.
 """
 
 from collections.abc import Callable
@@ -91,46 +91,63 @@ class Skipping:
         means, spread = _blocks(looked)
         # Only what stands still all the time stands for what comes; air moves no edge further than it dances.
         calm = spread < _CHANGE + moved / _BLOCK
-        now = _Kept(means.mean(0), spread, calm & _same(means.mean(0), spread, means), frames[0])
+        now = _Kept(means.mean(0), spread, calm & _same(means.mean(0), np.inf, spread, means), frames[0])
         kept = self._kept[turn]
-        whole = (slice(0, frames.shape[2]), slice(0, frames.shape[3]))
-        box = whole
+        sides = frames.shape[2:]
+        boxes = [(slice(0, sides[0]), slice(0, sides[1]))]
         if kept is not None:
-            known = calm & kept.steady & _same(kept.means, np.minimum(kept.spread, spread), means)
-            box = self._around(~known, *frames.shape[2:]) if not known.all() else (slice(0, 0), slice(0, 0))
-        share = (box[0].stop - box[0].start) * (box[1].stop - box[1].start) / (frames.shape[2] * frames.shape[3])
-        self.skipped.restored += share
-        self.skipped.still += 1 - share
-        if kept is None or box == whole:
+            known = calm & kept.steady & _same(kept.means, len(means), np.minimum(kept.spread, spread), means)
+            boxes = _around(~known, sides, self._multiple)
+        area = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
+        share = area / (sides[0] * sides[1])
+        if kept is None or share >= 1:
+            self.skipped.restored += 1
             restored = self._network(frames_BTCHW)
             now.picture = restored.mean(1)[0]
             self._kept[turn] = now
             return restored
+        self.skipped.restored += share
+        self.skipped.still += 1 - share
         out = np.repeat(kept.picture[None, None], len(frames), axis=1)
-        if share:
-            fresh = self._network(np.ascontiguousarray(frames_BTCHW[..., box[0], box[1]]))
-            weight = np.outer(*(_fade(part, side) for part, side in zip(box, frames.shape[2:], strict=True)))
-            place = out[..., box[0], box[1]]
-            place += weight.astype(np.float32) * (fresh - place)
-            kept.picture = kept.picture.copy()
-            kept.picture[:, box[0], box[1]] = place.mean(1)[0]
+        for box in boxes:
+            fresh = self._network(np.ascontiguousarray(frames_BTCHW[..., *box]))
+            weight = np.outer(*(_fade(part, side) for part, side in zip(box, sides, strict=True))).astype(np.float32)
+            out[..., *box] += weight * (fresh - out[..., *box])
+        if boxes:
+            now.picture = out.mean(1)[0]
             for name in ("means", "spread", "steady"):
-                setattr(kept, name, np.where(known, getattr(kept, name), getattr(now, name)))
+                setattr(now, name, np.where(known, getattr(kept, name), getattr(now, name)))
+            self._kept[turn] = now
         return out
 
-    def _around(self, changed_hw: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
-        """The rectangle around the blocks that have changed, a multiple of what the network takes."""
-        parts = []
-        for axis, side in ((1, height), (0, width)):
-            where = np.flatnonzero(changed_hw.any(axis))
-            starts = _starts(side)
-            end = starts[where[-1] + 1] if where[-1] + 1 < len(starts) else side
-            first = max(starts[where[0]] - _AROUND, 0) // self._multiple * self._multiple
-            length = -(-(min(end + _AROUND, side) - first) // self._multiple) * self._multiple
-            length = min(max(length, 4 * self._multiple), side)
-            first = min(first, side - length)
-            parts.append(slice(first, first + length))
-        return parts[0], parts[1]
+
+def _around(changed_hw: np.ndarray, sides: tuple[int, int], multiple: int) -> list[tuple[slice, slice]]:
+    """Rectangles around the blocks that have changed and what surrounds them, as large as a network takes them."""
+    found: list[tuple[int, int, int, int]] = []
+    ends = [[*_starts(side)[1:], side] for side in sides]
+    for row, column in np.argwhere(changed_hw):
+        top, left = max(row * _BLOCK - _AROUND, 0), max(column * _BLOCK - _AROUND, 0)
+        bottom, right = min(ends[0][row] + _AROUND, sides[0]), min(ends[1][column] + _AROUND, sides[1])
+        apart = []
+        for other in found:
+            if other[0] < bottom and top < other[1] and other[2] < right and left < other[3]:
+                top, bottom = min(top, other[0]), max(bottom, other[1])
+                left, right = min(left, other[2]), max(right, other[3])
+            else:
+                apart.append(other)
+        found = [*apart, (top, bottom, left, right)]
+    return [
+        (_multiple(top, bottom, sides[0], multiple), _multiple(left, right, sides[1], multiple))
+        for top, bottom, left, right in found
+    ]
+
+
+def _multiple(first: int, end: int, side: int, multiple: int) -> slice:
+    """The smallest part of an axis that holds this one and that a network takes: four units at least."""
+    first = first // multiple * multiple
+    length = min(max(-(-(end - first) // multiple), 4) * multiple, side)
+    first = min(first, side - length)
+    return slice(first, first + length)
 
 
 def _fade(part: slice, side: int) -> np.ndarray:
@@ -187,11 +204,15 @@ def _blocks(frames_THW: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return means, np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.954
 
 
-def _same(expected_hw: np.ndarray, spread_hw: np.ndarray, means_Thw: np.ndarray) -> np.ndarray:
-    """Where a window, its first and last third show what is expected, so that nothing passes through: (h, w)."""
+def _same(expected_hw: np.ndarray, behind: float, spread_hw: np.ndarray, means_Thw: np.ndarray) -> np.ndarray:
+    """Where a window, its first and its last third show what is expected, so that nothing passes through: (h, w).
+
+    Args:
+        behind: frames that what is expected was the mean of; infinite where it is the mean of these frames themselves.
+    """
     third = max(len(means_Thw) // 3, 1)
     same = np.ones(expected_hw.shape, bool)
     for part in (means_Thw, means_Thw[:third], means_Thw[-third:]):
-        allowed = _CHANGE + _FLUCTUATION * spread_hw / np.sqrt(len(part))
+        allowed = _CHANGE + _FLUCTUATION * spread_hw * np.sqrt(1 / len(part) + 1 / behind)
         same &= np.abs(part.mean(0) - expected_hw) <= allowed
     return same
