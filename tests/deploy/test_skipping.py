@@ -101,6 +101,24 @@ def test_frames_alone_are_restored(scene):
     assert skipped == Skipped(restored=1)
 
 
+@pytest.mark.parametrize(("expected", "passes"), [(0.003, True), (0.02, False)])
+def test_a_frame_of_which_no_change_is_expected_passes(scene, expected, passes):
+    """What a few pixels need does not count; frames that have neighbours are judged by their dance."""
+
+    def maps(x):
+        found = np.full((1, x.shape[1], 3, *x.shape[3:]), expected, np.float32)
+        found[..., :4, :4] = 1.0
+        return found
+
+    skipped = Skipped()
+    out = Skipping(lambda x: 0.5 * x, 1, skipped, maps=maps)(scene.transpose(2, 0, 1)[None, None])[0, 0]
+    np.testing.assert_array_equal(out, scene.transpose(2, 0, 1) * (1 if passes else 0.5))
+    assert skipped == (Skipped(clean=1) if passes else Skipped(restored=1))
+    frames, skipped = seen(scene, 3.0, 8).transpose(0, 3, 1, 2), Skipped()
+    Skipping(lambda x: x, 1, skipped, maps=maps)(frames[None])
+    assert skipped == Skipped(restored=1)
+
+
 def test_tiles_keep_to_themselves(scene):
     """Two tiles, of which only the left one dances."""
     moving = seen(scene, 3.0, 16)

@@ -10,7 +10,7 @@ from turbnet.errors import ParameterError
 from turbnet.nets import build
 from turbnet.nets.dncnn import DnCNN
 from turbnet.nets.still import StillRestorer
-from turbnet.nets.uncertainty import LEAST, MOST, Uncertainty, UncertaintyNet, laplace_loss
+from turbnet.nets.uncertainty import LEAST, MOST, Maps, Uncertainty, UncertaintyNet, laplace_loss
 
 SMALL = {"name": "still", "widths": [4, 6, 8], "depths": [1, 1, 1]}
 MAPS = {"widths": [4, 6, 8], "depths": [1, 1, 1], "dropout": 0.2}
@@ -50,6 +50,14 @@ def test_scales_are_bounded_whatever_comes_in(trained):
         assert found.log_scale.min() >= LEAST
         assert found.log_scale.max() <= MOST
     assert found.maps.shape == (1, 1, 2, 16, 16)
+
+
+@torch.no_grad()
+def test_maps_alone_say_what_the_network_says(trained):
+    net, clip = trained({**SMALL, "maps": MAPS}).maps, torch.rand(1, 2, 3, 16, 24)
+    alone, found = Maps(net).train()(clip), net(clip, drop=False)
+    torch.testing.assert_close(alone[:, :, :2], found.maps)
+    torch.testing.assert_close(alone[:, :, 2], found.change.sum(2).abs().mean(2))
 
 
 @torch.no_grad()

@@ -119,3 +119,23 @@ def test_outputs_that_cannot_be(checkpoint, tmp_path, capsys):
     assert "ends in .onnx" in refused(capsys, tmp_path, source, "-o", str(tmp_path / "model.pt"))
     assert "does not exist" in refused(capsys, tmp_path, source, "-o", str(tmp_path / "none" / "model.onnx"))
     assert "frames = 0" in refused(capsys, tmp_path, source, "--frames", "0")
+
+
+def test_maps_alone(checkpoint, tmp_path, capsys):
+    config = {"name": "still", "widths": [4, 6, 8], "depths": [1, 1, 1], "maps": {"widths": [4, 6, 8]}}
+    torch.manual_seed(0)
+    network = build(config)
+    weights = {f"net.{name}": weight for name, weight in network.state_dict().items()}
+    torch.save(
+        {**checkpoint, "state_dict": weights, "hyper_parameters": {"net": config, "seed": 1}}, tmp_path / "still.ckpt"
+    )
+    target = tmp_path / "maps.onnx"
+    assert run(["export", str(tmp_path / "still.ckpt"), "--maps", "-o", str(target), "--quiet"]) == 0
+    model = Model.load(target)
+    assert (model.card.architecture, model.card.frames) == ("uncertainty maps", 1)
+    assert model(np.zeros((1, 2, 3, 32, 40), np.float32)).shape == (1, 2, 3, 32, 40)
+
+    torch.save(checkpoint, tmp_path / "last.ckpt")
+    assert run(["export", str(tmp_path / "last.ckpt"), "--maps"]) == 2
+    assert "no uncertainty maps" in capsys.readouterr().err
+    assert run(["export", str(tmp_path / "last.ckpt"), "--maps", "--streaming"]) == 2

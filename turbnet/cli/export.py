@@ -25,13 +25,17 @@ def export(
     streaming: Annotated[
         bool, typer.Option("--streaming", help="frame by frame, carrying what was seen along, in place of windows")
     ] = False,
+    maps: Annotated[
+        bool,
+        typer.Option("--maps", help="the uncertainty maps of a network that has them, in place of what it restores"),
+    ] = False,
     horizon: Annotated[float, typer.Option(help="with --streaming: frames after which what was seen has faded")] = 50.0,
     remember: Annotated[int, typer.Option(help="with --streaming: frames whose keys and values are kept")] = 6,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no summary")] = False,
 ) -> int:
     """Write the network of a checkpoint as an ONNX file with its model card, proven against torch."""
-    from turbnet.deploy.checkpoint import card_of, frame_by_frame, load_network
+    from turbnet.deploy.checkpoint import card_of, frame_by_frame, load_network, maps_alone
     from turbnet.deploy.export import TOLERANCE, export_onnx
     from turbnet.deploy.session import Model
     from turbnet.errors import InputError, check_range
@@ -45,6 +49,10 @@ def export(
         trained = (hyper_parameters.get("recipe") or {}).get("frames", 12)
         frames = trained if isinstance(trained, int) else trained[-1]  # of a range the most
     card = card_of(network, hyper_parameters, int(check_range("frames", frames, 1, 1000)))
+    if maps and streaming:
+        raise InputError("give --maps or --streaming, not both")
+    if maps:
+        network, card = maps_alone(network, card)
     if streaming:
         network, card = frame_by_frame(network, card, horizon, remember)
     report = Report()

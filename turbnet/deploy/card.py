@@ -13,6 +13,9 @@ from turbnet.errors import InputError
 from turbnet.media.atomic import atomic_path
 
 PREFIX = "turbnet."
+MAPS = "uncertainty maps"
+"""Architecture on the card of a network that restores nothing but says where there is something to restore."""
+
 _LATER = ("carried",)  # fields that older files lack
 
 

@@ -6,12 +6,14 @@ from typing import Any
 
 from torch import nn
 
-from turbnet.deploy.card import ModelCard
+from turbnet.deploy.card import MAPS, ModelCard
 from turbnet.errors import InputError
 from turbnet.nets import build
 from turbnet.nets.redegradation import Redegrading
 from turbnet.nets.restorer import Restorer
+from turbnet.nets.still import StillRestorer
 from turbnet.nets.streaming import StreamingRestorer
+from turbnet.nets.uncertainty import Maps
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
 
 
@@ -76,6 +78,21 @@ def frame_by_frame(
     }
     notes = {"frame by frame": f"horizon {horizon:g} frames, keys and values of {remember}", **card.notes}
     return wrapped, replace(card, frames=1, notes=notes, carried=carried)
+
+
+def maps_alone(network: nn.Module, card: ModelCard) -> tuple[Maps, ModelCard]:
+    """The part of a network that says what is uncertain, and its card.
+
+    Raises:
+        InputError: the network has no maps.
+    """
+    if not isinstance(network, StillRestorer) or network.maps is None:
+        raise InputError(f"{card.architecture} has no uncertainty maps; turbnet train experiment=still makes them")
+    notes = {
+        "output": "scale of what the tilt has changed, of what the blur has, and the change to expect",
+        **card.notes,
+    }
+    return Maps(network.maps), replace(card, architecture=MAPS, config=card.config["maps"], frames=1, notes=notes)
 
 
 def _without_folders(value: Any) -> Any:

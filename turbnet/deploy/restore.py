@@ -107,17 +107,20 @@ class FrameByFrame:
 Ready = Model | ClassicalMethod | FrameByFrame | Skipping
 
 
-def ready(model: Model | ClassicalMethod, tiles: int, skipped: Skipped | None = None) -> Ready:
+def ready(
+    model: Model | ClassicalMethod, tiles: int, skipped: Skipped | None = None, maps: Model | None = None
+) -> Ready:
     """What `restore_frames` takes for one pass over a clip of so many tiles a frame; what is carried starts from nothing.
 
     Args:
         skipped: counts what a model that takes whole windows is spared; None: it is spared nothing.
+        maps: says of single frames what needs nothing.
     """
     if isinstance(model, ClassicalMethod):
         return model
     if model.card.carried:
         return FrameByFrame(model, tiles)
-    return model if skipped is None else Skipping(model, tiles, skipped, model.card.size_multiple)
+    return model if skipped is None else Skipping(model, tiles, skipped, model.card.size_multiple, maps)
 
 
 def tiling_of(model: Model | ClassicalMethod, tile: int = TILE, overlap: int | None = None) -> Tiling:
@@ -161,6 +164,7 @@ def restore_clip(
     window: int | None = None,
     passes: int = 1,
     skip: bool = False,
+    maps: Model | None = None,
     quiet: bool = True,
 ) -> Restoration:
     """Restore the clip in the file `source` into the file `destination`, which appears whole or not at all.
@@ -172,6 +176,7 @@ def restore_clip(
         window: frames restored together; None: what the model's card recommends, 50 for a classical method.
         passes: how often; a second pass restores what the first one left, for blur stronger than a network can undo at once.
         skip: spare a model the tiles that need nothing, see `turbnet.deploy.skipping`.
+        maps: with `skip`, the network that says what single frames need.
         quiet: no progress bar on standard error.
 
     Raises:
@@ -203,7 +208,7 @@ def restore_clip(
 
         frames: Iterable[np.ndarray] = clip
         for _ in range(passes):
-            whole = ready(model, tiles, skipped if skip else None)
+            whole = ready(model, tiles, skipped if skip else None, maps)
             frames = restore_frames(frames, partial(timed, whole=whole), tiling, window)
         for frame_HWC in frames:
             writer.write(frame_HWC)

@@ -9,6 +9,9 @@ alike. From the pixels of the strongest and of the weakest gradients,
 with v the variance over time; medians, so that what moves of itself does not count. Below a tenth of a pixel, D/r0 = 0.08,
 there is nothing to restore and the frames pass as they are.
 
+**A frame by itself** does not dance. If a network of uncertainty maps is there, it says what change to expect; where it
+expects less than 1.5 levels of 255 (but for one pixel in 200), the frame passes as it is.
+
 **Nothing has changed.** A still background is restored once. Where the means over blocks of 16 x 16 pixels are, all through
 a window, what they were when the block was last restored, as far as they fluctuate, what was restored then stands for the
 whole window. The network sees rectangles around the other blocks, with 32 pixels around them, over which the new fades
@@ -31,6 +34,7 @@ _AROUND = 32  # pixels of context around what has changed
 _CHANGE = 0.012  # of a block's mean, full scale 1: three steps of eight bits
 _FLUCTUATION = 5.0  # standard errors
 _QUIET = 0.75 / 255  # RMS: the last bit of eight
+_EXPECTED, _RARE = 1.5 / 255, 0.995
 
 
 @dataclass
@@ -66,12 +70,19 @@ class Skipping:
         tiles: of a frame.
         skipped: counts what was spared.
         multiple: sides the network accepts are multiples of this, pixels.
+        maps: (1, T, C, h, w) -> (1, T, 3, h, w), scales of tilt and blur and the change to expect; None: frames by
+            themselves are all restored.
     """
 
     def __init__(
-        self, network: Callable[[np.ndarray], np.ndarray], tiles: int, skipped: Skipped, multiple: int = 8
+        self,
+        network: Callable[[np.ndarray], np.ndarray],
+        tiles: int,
+        skipped: Skipped,
+        multiple: int = 8,
+        maps: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        self._network, self.skipped, self._multiple = network, skipped, multiple
+        self._network, self.skipped, self._multiple, self._maps = network, skipped, multiple, maps
         self._kept: list[_Kept | None] = [None] * tiles
         self._turn = 0
 
@@ -80,6 +91,9 @@ class Skipping:
         turn, self._turn = self._turn, (self._turn + 1) % len(self._kept)
         frames = frames_BTCHW[0]
         if len(frames) == 1:
+            if self._maps is not None and np.quantile(self._maps(frames_BTCHW)[:, :, 2], _RARE) < _EXPECTED:
+                self.skipped.clean += 1
+                return frames_BTCHW
             self.skipped.restored += 1
             return self._network(frames_BTCHW)
         looked = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))].mean(1)

@@ -8,13 +8,18 @@ from turbnet.errors import InputError
 DEFAULT = "s"
 """The released network that restores unless another is asked for."""
 
-RECOGNISER = "recogniser"
-"""Name of the released network that reads text; it restores nothing."""
+RECOGNISER, MAPS = "recogniser", "maps"
+"""Names of the released networks that read text and that say what is uncertain; they restore nothing."""
 
 
 def released_models() -> dict[str, Path]:
     """File of each released network that restores, by name."""
-    return {path.stem: path for path in sorted(_folder().glob("*.onnx")) if path.stem != RECOGNISER}
+    return {path.stem: path for path in sorted(_folder().glob("*.onnx")) if path.stem not in (RECOGNISER, MAPS)}
+
+
+def released_maps() -> Path:
+    """File of the network that says where a frame needs restoration."""
+    return _folder() / f"{MAPS}.onnx"
 
 
 def released_recogniser() -> Path:

@@ -101,6 +101,24 @@ class UncertaintyNet(nn.Module):
         return Uncertainty(changes.mean(0), log_scale.clamp(LEAST, MOST))
 
 
+class Maps(nn.Module):
+    """What a frame's maps say, and nothing else: b_tilt, b_blur and the change to be expected, as pictures.
+
+    Args:
+        net: whose maps.
+    """
+
+    def __init__(self, net: UncertaintyNet) -> None:
+        super().__init__()
+        self.net, self.size_multiple = net, net.size_multiple
+
+    def forward(self, frames_BTCHW: Tensor) -> Tensor:
+        """(B, T, 3, H, W); the change is the mean over channels of |m_tilt + m_blur|."""
+        found = self.net(frames_BTCHW, drop=False)
+        change = found.change.sum(2).abs().mean(2, keepdim=True)
+        return torch.cat((found.maps, change.float()), dim=2)
+
+
 def laplace_loss(found: Uncertainty, tilt_BTCHW: Tensor, blur_BTCHW: Tensor) -> Tensor:
     """Mean negative log-likelihood of the true parts I_0 - I and J - I_0, without the constant."""
     truth = torch.stack((tilt_BTCHW, blur_BTCHW), dim=2).float()
