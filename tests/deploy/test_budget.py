@@ -1,0 +1,48 @@
+"""A point of the measured curve for a time or a quality."""
+
+import pytest
+
+from turbnet.deploy import budget
+from turbnet.deploy.budget import Setting
+from turbnet.errors import InputError
+
+POINTS = [Setting("s", 1, 1.0, 1.0), Setting("s", 8, 4.0, 2.0), Setting("s", 32, 6.0, 4.0)]
+
+
+@pytest.fixture(autouse=True)
+def three_points(monkeypatch):
+    monkeypatch.setattr(budget, "curve", lambda: POINTS)
+
+
+@pytest.mark.parametrize(("gain", "window"), [(0.0, 1), (1.0, 1), (1.1, 8), (6.0, 32)])
+def test_the_cheapest_that_gains_enough(gain, window):
+    assert budget.for_quality(gain).window == window
+
+
+@pytest.mark.parametrize(("milliseconds", "window"), [(71, 1), (139, 8), (277, 32), (1e6, 32)])
+def test_the_best_within_the_budget(milliseconds, window):
+    """This machine is as fast as the one that measured: 256 x 256 pixels take 65.5 ms at the cheapest point."""
+    assert budget.for_budget(milliseconds, 256, 256, measure=lambda point, threads: 1.0).window == window
+
+
+def test_a_slower_machine_does_less():
+    assert budget.for_budget(277, 256, 256, measure=lambda point, threads: 3.0).window == 1
+
+
+def test_tiles_that_overlap_cost_more():
+    """512 x 512 is four tiles of 272 x 272: 0.296 million pixels, not 0.262."""
+    with pytest.raises(InputError, match="296 ms here at the least"):
+        budget.for_budget(280, 512, 512, measure=lambda point, threads: 1.0)
+
+
+def test_what_nothing_can_do():
+    with pytest.raises(InputError, match="the most is 6.0 dB"):
+        budget.for_quality(7.0)
+    with pytest.raises(InputError, match="at the least"):
+        budget.for_budget(10, 256, 256, measure=lambda point, threads: 1.0)
+    with pytest.raises(InputError, match="budget-ms"):
+        budget.for_budget(-1, 256, 256)
+
+
+def test_this_machine_takes_some_time():
+    assert 0.05 < budget.seconds_here(Setting("s", 1, 0.0, 0.0), threads=1) < 1000
