@@ -1,6 +1,7 @@
 """`turbnet restore` on files, as a user runs it. The network blends each frame with the mean of its window."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -208,6 +209,30 @@ def test_starts_without_torch(model, tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_starts_soon_and_on_the_threads_it_is_given(tmp_path):
+    """Counted in processor time and in threads, which other work on the machine does not change."""
+    source = write(tmp_path / "in.mp4", moving_clip(12, 64, 64))
+    code = f"""
+import os, resource
+from turbnet.cli import run
+from turbnet.deploy.session import Model
+threads, used, call = [], [], Model._run
+def watched(*arguments):
+    threads.append(len(os.listdir("/proc/self/task")))
+    used.append(sum(resource.getrusage(resource.RUSAGE_SELF)[:2]))
+    return call(*arguments)
+Model._run = watched
+run(["restore", {str(source)!r}, "-o", {str(tmp_path / "out.mp4")!r}, "--window", "4", "--threads", "1", "--quiet"])
+print(used[0], *threads)
+"""
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    used, *threads = done.stdout.split()
+    assert float(used) < 2  # seconds to the first window
+    assert len(threads) == 4
+    assert {int(count) for count in threads} <= {1, 2}  # onnxruntime keeps one that sleeps
 
 
 def test_help():

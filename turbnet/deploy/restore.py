@@ -181,8 +181,8 @@ def restore_clip(
     passes = int(check_range("passes", passes, 1, 8))
     count, inside, start, skipped = 0, 0.0, time.perf_counter(), Skipped()
     with (
-        open_clip(source, crop) as clip,
-        open_writer(destination, fps=clip.info.fps, grey=clip.info.grey) as writer,
+        open_clip(source, crop, model.threads) as clip,
+        open_writer(destination, clip.info.fps, clip.info.grey, model.threads) as writer,
         progress_bar(quiet) as progress,
     ):
         info = clip.info

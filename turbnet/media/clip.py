@@ -57,19 +57,22 @@ class ClipReader:
             self._pass.close()
 
 
-def open_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> ClipReader:
+def open_clip(
+    path: str | Path, crop: tuple[int, int, int, int] | None = None, threads: int | None = None
+) -> ClipReader:
     """Open an image, a folder of images, a GIF, a multi-page TIFF or a video for reading.
 
     Args:
         path: file, folder, or pattern of image files such as `frames/*.tif`. Stills and TIFFs, which carry no rate, get
             25 frames per second; a GIF's rate is that of its first frame.
         crop: (left, top, width, height) in pixels; None: the whole picture.
+        threads: of a video's decoder; None: all cores.
 
     Raises:
         InputError: the path is missing, empty, damaged or not a clip, its frames differ in size, or the crop does not
             lie inside the picture. Damage further on in the clip is raised when the iteration comes to it.
     """
-    return ClipReader(Path(path), open_source(Path(path)), crop)
+    return ClipReader(Path(path), open_source(Path(path), threads), crop)
 
 
 def read_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> tuple[NDArray[np.float32], ClipInfo]:

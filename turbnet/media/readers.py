@@ -24,7 +24,6 @@ from typing import Any
 
 import av
 import numpy as np
-import tifffile
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
@@ -65,8 +64,11 @@ class Source:
     frames: Callable[[], Iterator[Frame]]
 
 
-def open_source(path: Path) -> Source:
-    """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name."""
+def open_source(path: Path, threads: int | None = None) -> Source:
+    """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name.
+
+    `threads` are a video decoder's; None: all cores.
+    """
     if path.is_dir():
         return _folder(path)
     if not path.exists() and any(sign in path.name for sign in "*?["):
@@ -81,7 +83,7 @@ def open_source(path: Path) -> Source:
     if kind:
         return _pillow(path)
     if path.suffix.lower() in VIDEOS:
-        return _video(path)
+        return _video(path, threads)
     if path.suffix.lower() in IMAGES | {".gif"}:
         raise InputError(f"cannot read {path}: its content is not an image")
     raise InputError(
@@ -192,6 +194,8 @@ def _deep_png(path: Path) -> Iterator[Frame]:
 
 
 def _tiff(path: Path) -> Source:
+    import tifffile  # a tenth of the start of a command that may never see one
+
     # Its warnings about a damaged file would stand beside our one line.
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
     with _reading(path), tifffile.TiffFile(path) as tiff:
@@ -218,6 +222,8 @@ def _is_thumbnail(page: Any) -> bool:
 
 
 def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
+    import tifffile
+
     page = page.aspage()
     if page.photometric in (tifffile.PHOTOMETRIC.PALETTE, tifffile.PHOTOMETRIC.YCBCR) or page.compression not in (
         tifffile.COMPRESSION.NONE,
@@ -290,9 +296,9 @@ def _still(path: Path) -> Source:
 # --- video -------------------------------------------------------------------------------------------------------
 
 
-def _video(path: Path) -> Source:
+def _video(path: Path, threads: int | None) -> Source:
     with _reading(path), av.open(_ffmpeg_name(path)) as container:
-        stream = _video_stream(container, path)
+        stream = _video_stream(container, path, threads)
         context = stream.codec_context
         frame = next(container.decode(stream), None)
         if frame is None:
@@ -304,7 +310,7 @@ def _video(path: Path) -> Source:
 
     def frames() -> Iterator[Frame]:
         with _reading(path), av.open(_ffmpeg_name(path)) as container:
-            yield from _decode(container, path)
+            yield from _decode(container, path, threads)
 
     return Source(info, frames)
 
@@ -314,16 +320,17 @@ def _ffmpeg_name(path: Path) -> str:
     return str(path.absolute())
 
 
-def _video_stream(container: Any, path: Path) -> Any:
+def _video_stream(container: Any, path: Path, threads: int | None) -> Any:
     if not container.streams.video:
         raise InputError(f"{path} holds no video")
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
+    stream.codec_context.thread_count = threads or 0  # FFmpeg's 0 is all cores
     return stream
 
 
-def _decode(container: Any, path: Path) -> Iterator[Frame]:
-    stream = _video_stream(container, path)
+def _decode(container: Any, path: Path, threads: int | None) -> Iterator[Frame]:
+    stream = _video_stream(container, path, threads)
     interval = 1 / float(stream.average_rate or DEFAULT_FPS)
     packets, count, end = 0, 0, 0.0
     for packet in container.demux(stream):
@@ -352,17 +359,18 @@ def _declared_duration(container: Any, stream: Any) -> float:
 
 
 def _video_pixels(frame: Any, path: Path) -> Frame:
+    # On one thread: PyAV would start new ones for each frame.
     bits = max(component.bits for component in frame.format.components)
     if frame.format.name == "gray":
         pixels = frame.to_ndarray()
     elif bits <= 8:
-        pixels = frame.reformat(format="rgb24", interpolation=_ACCURATE).to_ndarray()
+        pixels = frame.reformat(format="rgb24", interpolation=_ACCURATE, threads=1).to_ndarray()
     else:
         # FFmpeg brings deep YUV's white to 255 * 256, and n bits of grey by a shift to the upper end of 16.
         yuv = len(frame.format.components) > 1 and not frame.format.is_rgb
         shifted = ((1 << bits) - 1) << (16 - bits) if frame.format.name.startswith("gray") else 65535
         white = np.float32(255 * 256 if yuv else shifted)
-        pixels = frame.reformat(format="rgb48le", interpolation=_ACCURATE).to_ndarray()
+        pixels = frame.reformat(format="rgb48le", interpolation=_ACCURATE, threads=1).to_ndarray()
         pixels = np.minimum(pixels / white, np.float32(1))
     # A display rotation counts anticlockwise, as NumPy's does.
     return _rgb(np.rot90(pixels, frame.rotation // 90), path)

@@ -13,13 +13,13 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
 
 import av
 import numpy as np
-import tifffile
 from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from numpy.typing import NDArray
 from PIL import GifImagePlugin, Image
@@ -41,6 +41,15 @@ class Encoder(Protocol):
     def write(self, frame: Pixels) -> None: ...
 
     def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a clip's header says, and how many threads write it; as in `open_writer`."""
+
+    fps: float
+    grey: bool
+    threads: int | None
 
 
 class ClipWriter:
@@ -75,13 +84,16 @@ class ClipWriter:
 
 
 @contextmanager
-def open_writer(path: str | Path, fps: float = 25.0, grey: bool = False) -> Iterator[ClipWriter]:
+def open_writer(
+    path: str | Path, fps: float = 25.0, grey: bool = False, threads: int | None = None
+) -> Iterator[ClipWriter]:
     """Write a clip frame by frame: `with open_writer(path) as writer: writer.write(frame)`.
 
     Args:
         path: the extension tells the kind, see the module.
         fps: frames per second, 0.01 to 1000.
         grey: store the Rec. 709 luma in one channel where the kind has one (all but .mp4, .mov and .webp).
+        threads: of a video's encoder; None: as many as the encoder likes.
 
     Raises:
         InputError: unknown extension, an output that cannot be written, no frame, or several frames for a still.
@@ -92,7 +104,7 @@ def open_writer(path: str | Path, fps: float = 25.0, grey: bool = False) -> Iter
     check_range("fps", fps, 0.01, 1000.0)
     with atomic_path(path) as temporary:
         with _writing(path):
-            encoder = encoder_of(temporary, fps, grey)
+            encoder = encoder_of(temporary, Layout(fps, grey, threads))
         writer = ClipWriter(path, encoder, grey)
         try:
             yield writer
@@ -117,7 +129,7 @@ def write_clip(
             writer.write(frame)
 
 
-def _encoder_of(path: Path) -> Callable[[Path, float, bool], Encoder]:
+def _encoder_of(path: Path) -> Callable[[Path, Layout], Encoder]:
     extension = path.suffix.lower()
     if extension not in _ENCODERS:
         known = ", ".join(name for name in _ENCODERS if name)
@@ -139,7 +151,7 @@ def _quantised(frame: Pixels) -> NDArray[np.uint8]:
 
 
 class _Folder:
-    def __init__(self, path: Path, fps: float, grey: bool) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.path, self.count = path, 0
         path.mkdir()
 
@@ -152,7 +164,7 @@ class _Folder:
 
 
 class _Still:
-    def __init__(self, path: Path, fps: float, grey: bool) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.path, self.written = path, False
 
     def write(self, frame: Pixels) -> None:
@@ -169,9 +181,11 @@ class _Still:
 
 
 class _Tiff:
-    def __init__(self, path: Path, fps: float, grey: bool) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
+        import tifffile  # as in the readers
+
         self.writer = tifffile.TiffWriter(path)
-        self.photometric = "minisblack" if grey else "rgb"
+        self.photometric = "minisblack" if layout.grey else "rgb"
         self.bytes = 0
 
     def write(self, frame: Pixels) -> None:
@@ -188,9 +202,9 @@ class _Tiff:
 class _Gif:
     """Pillow's own multi-frame saving merges equal neighbours and holds the clip in memory; this does neither."""
 
-    def __init__(self, path: Path, fps: float, grey: bool) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.file = path.open("wb")
-        self.duration = max(10, 10 * round(100.0 / fps))
+        self.duration = max(10, 10 * round(100.0 / layout.fps))
         self.started = False
 
     def write(self, frame: Pixels) -> None:
@@ -212,10 +226,10 @@ class _Gif:
 class _Video(ABC):
     """A codec says how its stream is set up and how a picture becomes its frame."""
 
-    def __init__(self, path: Path, fps: float, grey: bool) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.container = av.open(str(path), "w")
-        self.rate = Fraction(fps).limit_denominator(60_060)
-        self.grey = grey
+        self.rate = Fraction(layout.fps).limit_denominator(60_060)
+        self.grey, self.threads = layout.grey, layout.threads
         self.count = 0
         self.stream: Any = None
 
@@ -228,7 +242,9 @@ class _Video(ABC):
         """A picture as the codec wants it."""
 
     def write(self, frame: Pixels) -> None:
-        self.stream = self.stream or self.open_stream(*frame.shape[:2])
+        if self.stream is None:
+            self.stream = self.open_stream(*frame.shape[:2])
+            self.stream.codec_context.thread_count = self.threads or 0
         encoded = self.frame(_quantised(frame))
         encoded.pts, encoded.time_base = self.count, 1 / self.rate
         self.count += 1
@@ -257,6 +273,7 @@ class _H264(_Video):
             dst_colorspace=Colorspace.ITU709,
             dst_color_range=ColorRange.MPEG,
             interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND,
+            threads=1,  # as in the readers
         )
 
 
@@ -270,10 +287,10 @@ class _Ffv1(_Video):
     def frame(self, pixels: NDArray[np.uint8]) -> av.VideoFrame:
         if self.grey:
             return av.VideoFrame.from_ndarray(pixels, "gray")
-        return av.VideoFrame.from_ndarray(pixels, "rgb24").reformat(format="bgr0")
+        return av.VideoFrame.from_ndarray(pixels, "rgb24").reformat(format="bgr0", threads=1)
 
 
-_ENCODERS: dict[str, Callable[[Path, float, bool], Encoder]] = {
+_ENCODERS: dict[str, Callable[[Path, Layout], Encoder]] = {
     ".mp4": _H264,
     ".mov": _H264,
     ".mkv": _Ffv1,
