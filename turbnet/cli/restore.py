@@ -1,5 +1,6 @@
 """`turbnet restore`: a turbulent clip to a clear one."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -72,6 +73,9 @@ def restore(
         report.add(Row("tiles of windows that were clean", done.skipped.clean))
         report.add(Row("tiles of windows that had not changed", done.skipped.still))
         report.write(json)
+    if done.left_out and not quiet:
+        codecs = ", ".join(done.left_out)
+        print(f"turbnet restore: the sound ({codecs}) was left out, {output} does not take it", file=sys.stderr)
     if not quiet:
         frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
         spared = f", {done.skipped.saved:.0%} of the tiles skipped" if done.skipped.saved else ""

@@ -1,10 +1,12 @@
 """Clips through a released network or a classical method: file in, file out."""
 
-import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
@@ -31,6 +33,7 @@ class Restoration:
         seconds: wall-clock time from the first frame read to the last one written.
         network_seconds: the part of it spent inside the network or the method.
         skipped: what the network was spared.
+        left_out: codecs of the sound that the destination does not take.
     """
 
     frames: int
@@ -41,6 +44,7 @@ class Restoration:
     seconds: float
     network_seconds: float
     skipped: Skipped
+    left_out: list[str]
 
     @property
     def milliseconds_a_frame(self) -> float:
@@ -179,10 +183,11 @@ def restore_clip(
     """
     tiling, window = tiling_of(model, tile, overlap), window_of(model, window)
     passes = int(check_range("passes", passes, 1, 8))
-    count, inside, start, skipped = 0, 0.0, time.perf_counter(), Skipped()
+    count, inside, start, skipped = 0, 0.0, perf_counter(), Skipped()
     with (
         open_clip(source, crop, model.threads) as clip,
-        open_writer(destination, clip.info.fps, clip.info.grey, model.threads) as writer,
+        clip.sound() as sound,
+        open_writer(destination, clip.info.fps, clip.info.grey, model.threads, clip.info.tick, sound) as writer,
         progress_bar(quiet) as progress,
     ):
         info = clip.info
@@ -192,21 +197,29 @@ def restore_clip(
 
         def timed(frames_BTCHW: np.ndarray, whole: Ready) -> np.ndarray:
             nonlocal inside
-            began = time.perf_counter()
+            began = perf_counter()
             if isinstance(whole, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
                 restored_BTCHW = whole(frames_BTCHW, lambda share: progress.advance(task, share))
             else:
                 restored_BTCHW = whole(frames_BTCHW)
                 progress.advance(task)
-            inside += time.perf_counter() - began
+            inside += perf_counter() - began
             return restored_BTCHW
 
-        frames: Iterable[np.ndarray] = clip
+        times: deque[Fraction | None] = deque()  # of the frames that have come in and not gone out
+
+        def incoming() -> Iterator[np.ndarray]:
+            for time, frame_HWC in clip.timed():
+                times.append(time)
+                yield frame_HWC
+
+        frames: Iterable[np.ndarray] = incoming()
         for _ in range(passes):
             whole = ready(model, tiles, skipped if skip else None)
             frames = restore_frames(frames, partial(timed, whole=whole), tiling, window)
         for frame_HWC in frames:
-            writer.write(frame_HWC)
+            writer.write(frame_HWC, times.popleft())
             count += 1
-    seconds = time.perf_counter() - start
-    return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside, skipped)
+    seconds = perf_counter() - start
+    left_out = list(sound.left_out.values()) if sound else []
+    return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside, skipped, left_out)
