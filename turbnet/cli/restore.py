@@ -1,6 +1,9 @@
 """`turbnet restore`: a turbulent clip to a clear one."""
 
+import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -15,8 +18,10 @@ def main(arguments: list[str]) -> int:
 
 
 def restore(
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video or TIFF")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what")],
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video, TIFF, camera; - reads a pipe")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what, - is a pipe")],
     model: Annotated[
         str | None, typer.Option(help="a released model by name, or an ONNX file of turbnet export; default: s")
     ] = None,
@@ -44,23 +49,27 @@ def restore(
     from turbnet.deploy.weights import DEFAULT, find_model
     from turbnet.errors import InputError
     from turbnet.media.atomic import check_output
+    from turbnet.media.live import STANDARD, is_live
     from turbnet.report import Report, Row
 
     if model and method:
         raise InputError("give --model or --method, not both")
     if json:
         check_output(json)
-    done = restore_clip(
-        source,
-        output,
-        ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads),
-        crop=parse_crop(crop),
-        tile=tile,
-        window=window,
-        passes=passes,
-        skip=skip,
-        quiet=quiet,
-    )
+    network = ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads)
+    with _ended_by_interrupt() if is_live(source) else nullcontext(lambda: False) as ended:
+        done = restore_clip(
+            source,
+            output,
+            network,
+            crop=parse_crop(crop),
+            tile=tile,
+            window=window,
+            passes=passes,
+            skip=skip,
+            quiet=quiet,
+            ended=ended,
+        )
     if json:
         report = Report()
         report.add(Row("frames", done.frames))
@@ -79,4 +88,24 @@ def restore(
     if not quiet:
         frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
         spared = f", {done.skipped.saved:.0%} of the tiles skipped" if done.skipped.saved else ""
-        print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}")
+        print(
+            f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}",
+            file=sys.stderr if output == STANDARD else sys.stdout,
+        )
+
+
+@contextmanager
+def _ended_by_interrupt() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C tells a source to end; a second one interrupts the command."""
+    ended = False
+
+    def end(number: int, frame: object) -> None:
+        nonlocal ended
+        ended = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield lambda: ended
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -166,10 +166,13 @@ def restore_clip(
     passes: int = 1,
     skip: bool = False,
     quiet: bool = True,
+    ended: Callable[[], bool] = lambda: False,
 ) -> Restoration:
     """Restore the clip in the file `source` into the file `destination`, which appears whole or not at all.
 
     Args:
+        source: file, folder or pattern of images, `-` for standard input, a named pipe, a camera.
+        destination: as the ending says; `-` for standard output, which takes frame by frame.
         crop: (left, top, width, height), pixels; None: the whole frame.
         tile: greatest side of a tile, pixels.
         overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
@@ -177,6 +180,7 @@ def restore_clip(
         passes: how often; a second pass restores what the first one left, for blur stronger than a network can undo at once.
         skip: spare a model the tiles that need nothing, see `turbnet.deploy.skipping`.
         quiet: no progress bar on standard error.
+        ended: whether a pipe or a camera is to end; what has come in by then is restored and written.
 
     Raises:
         InputError: the source cannot be read, the destination cannot be written, a parameter is out of range.
@@ -185,7 +189,7 @@ def restore_clip(
     passes = int(check_range("passes", passes, 1, 8))
     count, inside, start, skipped = 0, 0.0, perf_counter(), Skipped()
     with (
-        open_clip(source, crop, model.threads) as clip,
+        open_clip(source, crop, model.threads, ended) as clip,
         clip.sound() as sound,
         open_writer(destination, clip.info.fps, clip.info.grey, model.threads, clip.info.tick, sound) as writer,
         progress_bar(quiet) as progress,

@@ -3,7 +3,7 @@
 A frame is float32 (H, W, 3), RGB in [0, 1], sRGB-encoded as stored; `turbnet.media.colour` makes it linear.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ __all__ = ["ClipInfo", "ClipReader", "ClipWriter", "open_clip", "open_writer", "
 
 
 class ClipReader:
-    """A clip to iterate over, one frame in memory at a time; every iteration starts from the first frame."""
+    """A clip to iterate over, one frame in memory at a time; every iteration starts from the first frame, where it can."""
 
     def __init__(self, path: Path, source: Source, crop: tuple[int, int, int, int] | None) -> None:
         self.path = path
@@ -69,21 +69,26 @@ class ClipReader:
 
 
 def open_clip(
-    path: str | Path, crop: tuple[int, int, int, int] | None = None, threads: int | None = None
+    path: str | Path,
+    crop: tuple[int, int, int, int] | None = None,
+    threads: int | None = None,
+    ended: Callable[[], bool] = lambda: False,
 ) -> ClipReader:
-    """Open an image, a folder of images, a GIF, a multi-page TIFF or a video for reading.
+    """Open an image, a folder of images, a GIF, a multi-page TIFF, a video, a pipe or a camera for reading.
 
     Args:
         path: file, folder, or pattern of image files such as `frames/*.tif`. Stills and TIFFs, which carry no rate, get
-            25 frames per second; a GIF's rate is that of its first frame.
+            25 frames per second; a GIF's rate is that of its first frame. Or `-` for standard input, a named pipe, or a
+            camera such as /dev/video0, which can be passed over once only.
         crop: (left, top, width, height) in pixels; None: the whole picture.
         threads: of a video's decoder; None: all cores.
+        ended: whether a pipe or a camera is to end, asked again and again.
 
     Raises:
         InputError: the path is missing, empty, damaged or not a clip, its frames differ in size, or the crop does not
             lie inside the picture. Damage further on in the clip is raised when the iteration comes to it.
     """
-    return ClipReader(Path(path), open_source(Path(path), threads), crop)
+    return ClipReader(Path(path), open_source(Path(path), threads, ended), crop)
 
 
 def read_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> tuple[NDArray[np.float32], ClipInfo]:

@@ -1,10 +1,13 @@
 """Every kind of clip as a stream of float32 frames (H, W, 3), RGB in [0, 1], sRGB-encoded as stored, and their times.
 
 A reader gives a `Source`: what the header says, and a function that starts a fresh pass over the frames, one frame in
-memory at a time. Where the kind carries times (a video, a GIF), each frame comes with its own, exact, in seconds from the
-start of the clip; with None elsewhere. Broken files raise InputError, at the latest when the pass comes to the broken place:
+memory at a time; of a pipe or a camera there is one pass only. Where the kind carries times (a video, a GIF), each frame
+comes with its own, exact, in seconds from the start of the clip; with None elsewhere.
+
+Broken files raise InputError, at the latest when the pass comes to the broken place:
 
 - A still, a folder, a GIF or a TIFF that cannot be decoded to its end.
+- A stream from a pipe or a camera that FFmpeg does not know. What cannot be decoded later on is passed over, as players do.
 - A video whose decoder reports or conceals damage in a frame, or that ends before the frame count (MP4, MOV, AVI) or
   the duration (MKV, WebM, FLV; give or take two frames) that its header declares. A container that declares neither
   (MPEG, TS) is taken as it is.
@@ -18,7 +21,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -31,6 +34,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from turbnet.errors import InputError
+from turbnet.media.live import STANDARD, is_live, open_live
 from turbnet.media.sound import Sound, start_of
 
 Frame = NDArray[np.float32]
@@ -78,11 +82,15 @@ class Source:
     sound: Callable[[], AbstractContextManager[Sound | None]] = nullcontext
 
 
-def open_source(path: Path, threads: int | None = None) -> Source:
-    """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name.
+def open_source(path: Path, threads: int | None = None, ended: Callable[[], bool] = lambda: False) -> Source:
+    """The reader for `path`: live, a folder, a pattern of images, a file known by its first bytes or, a video, by its name.
 
-    `threads` are a video decoder's; None: all cores.
+    Args:
+        threads: a video decoder's; None: all cores.
+        ended: whether a pipe or a camera is to end, asked again and again.
     """
+    if is_live(path):
+        return _live(path, threads, ended)
     if path.is_dir():
         return _folder(path)
     if not path.exists() and any(sign in path.name for sign in "*?["):
@@ -317,14 +325,13 @@ def _still(path: Path) -> Source:
 def _video(path: Path, threads: int | None) -> Source:
     with _reading(path), av.open(_ffmpeg_name(path)) as container:
         stream = _video_stream(container, path, threads)
-        context = stream.codec_context
         frame = next(container.decode(stream), None)
         if frame is None:
             raise InputError(f"{path} holds no video frame")
         height, width = (frame.width, frame.height) if frame.rotation % 180 else (frame.height, frame.width)
         rate = stream.average_rate or stream.guessed_rate
-        grey = context.pix_fmt is not None and context.pix_fmt.startswith("gray")
-        info = ClipInfo(stream.frames or None, height, width, float(rate or DEFAULT_FPS), grey, stream.time_base)
+        fps = float(rate or DEFAULT_FPS)
+        info = ClipInfo(stream.frames or None, height, width, fps, _is_grey_video(stream), stream.time_base)
 
     def frames() -> Iterator[TimedFrame]:
         with _reading(path), av.open(_ffmpeg_name(path)) as container:
@@ -346,6 +353,56 @@ def _sound_packets(container: Any, path: Path) -> Iterator[Any]:
         for packet in container.demux(container.streams.audio):
             if packet.dts is not None:  # but for the empty one at the end
                 yield packet
+
+
+def _live(path: Path, threads: int | None, ended: Callable[[], bool]) -> Source:
+    name = Path("standard input") if path == STANDARD else path
+    with _reading(name):
+        container = open_live(path, ended)
+        stream = _video_stream(container, name, threads)
+        sound = Sound(container) if container.streams.audio else None
+        following = _decode_live(container, sound, name, threads, ended)
+        first = next(following, None)
+    if first is None:
+        raise InputError(f"{name} holds no video frame")
+    height, width = first[1].shape[:2]
+    rate = stream.average_rate or stream.guessed_rate
+    info = ClipInfo(None, height, width, float(rate or DEFAULT_FPS), _is_grey_video(stream), stream.time_base)
+    heard = False
+
+    def listen() -> AbstractContextManager[Sound | None]:
+        nonlocal heard
+        heard = True
+        return nullcontext(sound)
+
+    def frames() -> Iterator[TimedFrame]:
+        if sound and not heard:
+            sound.mute()
+        yield first
+        yield from following
+
+    return Source(info, frames, listen)
+
+
+def _decode_live(
+    container: Any, sound: Sound | None, path: Path, threads: int | None, ended: Callable[[], bool]
+) -> Iterator[TimedFrame]:
+    stream, start = _video_stream(container, path, threads), start_of(container)
+    with _reading(path), container:
+        for packet in container.demux([stream, *container.streams.audio]):
+            if ended():
+                return
+            if sound and packet.stream_index != stream.index:
+                if packet.dts is not None:  # but for the empty one at the end
+                    sound.waiting.append(packet)
+                continue
+            with suppress(av.FFmpegError):
+                for frame in packet.decode():
+                    yield _video_time(frame, start), _video_pixels(frame, path)
+
+
+def _is_grey_video(stream: Any) -> bool:
+    return (stream.codec_context.pix_fmt or "").startswith("gray")
 
 
 def _ffmpeg_name(path: Path) -> str:

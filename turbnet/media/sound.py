@@ -36,6 +36,11 @@ class Sound:
             packet.pts = begin - shift
             yield packet
 
+    def mute(self) -> None:
+        """Nobody listens: nothing waits any more."""
+        self.waiting = deque(maxlen=0)
+        self._packets = iter(())
+
     def _next(self) -> Any:
         if not self.waiting:
             self.waiting.extend(islice(self._packets, 1))

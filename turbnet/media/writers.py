@@ -1,4 +1,4 @@
-"""Clips out, the kind told by the extension; a clip appears whole or not at all.
+"""Clips out, the kind told by the extension; a clip appears whole or not at all, but for standard output.
 
 | extension | what is written |
 |---|---|
@@ -8,14 +8,16 @@
 | .tif .tiff | one page a frame, 16 bits a channel, uncompressed |
 | .png .jpg .bmp .webp | one frame, 8 bits a channel |
 | none | a folder of PNG files, 000000.png, 000001.png, ... |
+| the name - | standard output: FFV1 in Matroska, as a stream |
 
 The same frames give the same bytes, each time.
 """
 
 import math
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -29,6 +31,7 @@ from PIL import GifImagePlugin, Image
 
 from turbnet.errors import InputError, check_range
 from turbnet.media.atomic import atomic_path
+from turbnet.media.live import STANDARD
 from turbnet.media.sound import Sound
 
 Pixels = NDArray[Any]
@@ -101,7 +104,7 @@ def open_writer(
     """Write a clip frame by frame: `with open_writer(path) as writer: writer.write(frame)`.
 
     Args:
-        path: the extension tells the kind, see the module.
+        path: the extension tells the kind, see the module; `-` is standard output.
         fps: frames per second, 0.01 to 1000.
         grey: store the Rec. 709 luma in one channel where the kind has one (all but .mp4, .mov and .webp).
         threads: of a video's encoder; None: as many as the encoder likes.
@@ -115,7 +118,10 @@ def open_writer(
     path = Path(path)
     encoder_of = _encoder_of(path)
     check_range("fps", fps, 0.01, 1000.0)
-    with atomic_path(path) as temporary:
+    if sound and path.suffix.lower() not in _WITH_SOUND and path != STANDARD:
+        sound.mute()
+        sound = None
+    with nullcontext(path) if path == STANDARD else atomic_path(path) as temporary:
         with _writing(path):
             encoder = encoder_of(temporary, Layout(fps, grey, threads, tick, sound))
         writer = ClipWriter(path, encoder, grey)
@@ -143,6 +149,10 @@ def write_clip(
 
 
 def _encoder_of(path: Path) -> Callable[[Path, Layout], Encoder]:
+    if path == STANDARD:
+        if sys.stdout.isatty():
+            raise InputError("standard output is a terminal; pipe it into something, or name a file")
+        return _StandardOutput
     extension = path.suffix.lower()
     if extension not in _ENCODERS:
         known = ", ".join(name for name in _ENCODERS if name)
@@ -250,7 +260,7 @@ class _Video(ABC):
     """A codec says how its stream is set up and how a picture becomes its frame."""
 
     def __init__(self, path: Path, layout: Layout) -> None:
-        self.container = av.open(str(path), "w", container_options={"fflags": "+bitexact"})
+        self.container = self.open_container(path)
         self.rate = Fraction(layout.fps).limit_denominator(60_060)
         self.tick = layout.tick
         self.clock = _clock(1 / self.rate, self.tick)
@@ -258,6 +268,10 @@ class _Video(ABC):
         self.pts = -1
         self.stream: Any = None
         self.tracks: dict[int, Any] = {}
+
+    def open_container(self, path: Path) -> Any:
+        """Without what differs from one time to the next."""
+        return av.open(str(path), "w", container_options={"fflags": "+bitexact"})
 
     @abstractmethod
     def open_stream(self, height: int, width: int) -> Any:
@@ -359,12 +373,19 @@ class _Ffv1(_Video):
 
 class _Avi(_Ffv1):
     def __init__(self, path: Path, layout: Layout) -> None:
-        super().__init__(path, replace(layout, tick=None, sound=None))
+        super().__init__(path, replace(layout, tick=None))
 
     def write(self, frame: Pixels, time: Fraction | None) -> None:
         super().write(frame, None)
 
 
+class _StandardOutput(_Ffv1):
+    def open_container(self, path: Path) -> Any:
+        options = {"fflags": "+bitexact", "flush_packets": "1"}
+        return av.open(f"pipe:{sys.stdout.fileno()}", "w", format="matroska", container_options=options)
+
+
+_WITH_SOUND = {".mp4", ".mov", ".mkv"}
 _ENCODERS: dict[str, Callable[[Path, Layout], Encoder]] = {
     ".mp4": _H264,
     ".mov": _H264,
