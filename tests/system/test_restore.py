@@ -204,5 +204,16 @@ print(used[0], *threads)
 def test_help():
     done = turbnet("restore", "--help")
     assert done.returncode == 0
-    for option in ("--output", "--model", "--method", "--crop", "--window", "--tile", "--threads", "--json", "--quiet"):
+    for option in (
+        "--output",
+        "--model",
+        "--method",
+        "--crop",
+        "--window",
+        "--tile",
+        "--threads",
+        "--json",
+        "--quiet",
+        "--resume",
+    ):
         assert option in done.stdout

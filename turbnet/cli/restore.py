@@ -36,6 +36,9 @@ def restore(
     skip: Annotated[
         bool, typer.Option("--skip/--no-skip", help="leave out what needs no restoration or has not changed")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="keep restored frames until the clip is whole, and go on with those there")
+    ] = False,
     tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 320,
     threads: Annotated[int | None, typer.Option(help="processor threads; default: all cores")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
@@ -67,12 +70,14 @@ def restore(
             window=window,
             passes=passes,
             skip=skip,
+            resume=resume,
             quiet=quiet,
             ended=ended,
         )
     if json:
         report = Report()
         report.add(Row("frames", done.frames))
+        report.add(Row("frames restored by an earlier run", done.resumed))
         report.add(Row("height", done.height, "pixel"))
         report.add(Row("width", done.width, "pixel"))
         report.add(Row("window", done.window, "frame"))
@@ -87,9 +92,10 @@ def restore(
         print(f"turbnet restore: the sound ({codecs}) was left out, {output} does not take it", file=sys.stderr)
     if not quiet:
         frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
+        resumed = f", {done.resumed} of them by an earlier run" if done.resumed else ""
         spared = f", {done.skipped.saved:.0%} of the tiles skipped" if done.skipped.saved else ""
         print(
-            f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}",
+            f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}{resumed}",
             file=sys.stderr if output == STANDARD else sys.stdout,
         )
 

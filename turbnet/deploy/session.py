@@ -30,7 +30,7 @@ class Model:
     """
 
     def __init__(self, data: bytes, threads: int | None = None) -> None:
-        verify(data)
+        self.digest = verify(data)
         self.threads = int(check_range("threads", available_cores() if threads is None else threads, 1, 1024))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads

@@ -100,6 +100,7 @@ def open_writer(
     threads: int | None = None,
     tick: Fraction | None = None,
     sound: Sound | None = None,
+    within: Path | None = None,
 ) -> Iterator[ClipWriter]:
     """Write a clip frame by frame: `with open_writer(path) as writer: writer.write(frame)`.
 
@@ -110,6 +111,7 @@ def open_writer(
         threads: of a video's encoder; None: as many as the encoder likes.
         tick: seconds, of which the times given with the frames are multiples.
         sound: to copy where the kind takes it, see `Sound.left_out`.
+        within: folder on the same disk where the clip lies until it is whole; None: beside `path`.
 
     Raises:
         InputError: unknown extension, an output that cannot be written, no frame, or several frames for a still.
@@ -121,7 +123,7 @@ def open_writer(
     if sound and path.suffix.lower() not in _WITH_SOUND and path != STANDARD:
         sound.mute()
         sound = None
-    with nullcontext(path) if path == STANDARD else atomic_path(path) as temporary:
+    with nullcontext(path) if path == STANDARD else atomic_path(path, within) as temporary:
         with _writing(path):
             encoder = encoder_of(temporary, Layout(fps, grey, threads, tick, sound))
         writer = ClipWriter(path, encoder, grey)
