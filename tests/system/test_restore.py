@@ -1,53 +1,20 @@
 """`turbnet restore` on files, as a user runs it. The network blends each frame with the mean of its window."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 import tifffile
-from onnx import TensorProto, helper
 from PIL import Image
 from skimage import data
 
-from turbnet.deploy.card import ModelCard
-from turbnet.deploy.seal import seal
 from turbnet.media.clip import open_clip, open_writer
 
 WINDOW = 6
-
-
-def temporal_blend(weight: float = 0.25) -> onnx.ModelProto:
-    """restored = (1 - weight) frames + weight mean(frames over time)."""
-    shape = ["batch", "frames", 3, "height", "width"]
-    graph = helper.make_graph(
-        [
-            helper.make_node("ReduceMean", ["frames", "time"], ["mean"], keepdims=1),
-            helper.make_node("Sub", ["mean", "frames"], ["change"]),
-            helper.make_node("Mul", ["change", "weight"], ["step"]),
-            helper.make_node("Add", ["frames", "step"], ["restored"]),
-        ],
-        "blend",
-        [helper.make_tensor_value_info("frames", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("restored", TensorProto.FLOAT, shape)],
-        [
-            helper.make_tensor("time", TensorProto.INT64, [1], [1]),
-            helper.make_tensor("weight", TensorProto.FLOAT, [], [weight]),
-        ],
-    )
-    return helper.make_model(graph, ir_version=10, opset_imports=[helper.make_opsetid("", 20)])
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("model") / "blend.onnx"
-    document = temporal_blend()
-    helper.set_model_props(document, ModelCard("blend", {}, size_multiple=4, frames=WINDOW).to_metadata())
-    path.write_bytes(seal(document.SerializeToString()))
-    return path
 
 
 def turbnet(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -125,7 +92,7 @@ def test_grey_stays_grey(model, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def bad_files(model, tmp_path_factory) -> Path:
+def bad_files(model, blend, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("bad")
     write(folder / "good.tiff", moving_clip(3, 32, 40))
     tifffile.imwrite(folder / "nan.tiff", np.full((2, 32, 32, 3), np.nan, np.float32), photometric="rgb")
@@ -134,7 +101,7 @@ def bad_files(model, tmp_path_factory) -> Path:
     damaged = bytearray(model.read_bytes())
     damaged[len(damaged) // 3] ^= 1
     (folder / "damaged.onnx").write_bytes(damaged)
-    (folder / "foreign.onnx").write_bytes(temporal_blend().SerializeToString())
+    (folder / "foreign.onnx").write_bytes(blend.SerializeToString())
     (folder / "text.onnx").write_text("not a model")
     return folder
 
@@ -210,8 +177,43 @@ def test_starts_without_torch(model, tmp_path):
     assert done.stdout.strip() == "[]"
 
 
+def test_starts_soon_and_on_the_threads_it_is_given(tmp_path):
+    """Counted in processor time and in threads, which other work on the machine does not change."""
+    source = write(tmp_path / "in.mp4", moving_clip(12, 64, 64))
+    code = f"""
+import os, resource
+from turbnet.cli import run
+from turbnet.deploy.session import Model
+threads, used, call = [], [], Model._run
+def watched(*arguments):
+    threads.append(len(os.listdir("/proc/self/task")))
+    used.append(sum(resource.getrusage(resource.RUSAGE_SELF)[:2]))
+    return call(*arguments)
+Model._run = watched
+run(["restore", {str(source)!r}, "-o", {str(tmp_path / "out.mp4")!r}, "--window", "4", "--threads", "1", "--quiet"])
+print(used[0], *threads)
+"""
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    used, *threads = done.stdout.split()
+    assert float(used) < 2  # seconds to the first window
+    assert len(threads) == 4
+    assert {int(count) for count in threads} <= {1, 2}  # onnxruntime keeps one that sleeps
+
+
 def test_help():
     done = turbnet("restore", "--help")
     assert done.returncode == 0
-    for option in ("--output", "--model", "--method", "--crop", "--window", "--tile", "--threads", "--json", "--quiet"):
+    for option in (
+        "--output",
+        "--model",
+        "--method",
+        "--crop",
+        "--window",
+        "--tile",
+        "--threads",
+        "--json",
+        "--quiet",
+        "--resume",
+    ):
         assert option in done.stdout

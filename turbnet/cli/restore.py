@@ -1,5 +1,9 @@
 """`turbnet restore`: a turbulent clip to a clear one."""
 
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -14,8 +18,10 @@ def main(arguments: list[str]) -> int:
 
 
 def restore(
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video or TIFF")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what")],
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="image, folder of frames, video, TIFF, camera; - reads a pipe")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="where to write; the ending says what, - is a pipe")],
     model: Annotated[
         str | None, typer.Option(help="a released model by name, or an ONNX file of turbnet export; default: s")
     ] = None,
@@ -30,6 +36,9 @@ def restore(
     skip: Annotated[
         bool, typer.Option("--skip/--no-skip", help="leave out what needs no restoration or has not changed")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="keep restored frames until the clip is whole, and go on with those there")
+    ] = False,
     tile: Annotated[int, typer.Option(help="greatest side of a tile, pixels; less needs less memory")] = 320,
     threads: Annotated[int | None, typer.Option(help="processor threads; default: all cores")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="write what was measured as JSON")] = None,
@@ -43,26 +52,32 @@ def restore(
     from turbnet.deploy.weights import DEFAULT, find_model
     from turbnet.errors import InputError
     from turbnet.media.atomic import check_output
+    from turbnet.media.live import STANDARD, is_live
     from turbnet.report import Report, Row
 
     if model and method:
         raise InputError("give --model or --method, not both")
     if json:
         check_output(json)
-    done = restore_clip(
-        source,
-        output,
-        ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads),
-        crop=parse_crop(crop),
-        tile=tile,
-        window=window,
-        passes=passes,
-        skip=skip,
-        quiet=quiet,
-    )
+    network = ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads)
+    with _ended_by_interrupt() if is_live(source) else nullcontext(lambda: False) as ended:
+        done = restore_clip(
+            source,
+            output,
+            network,
+            crop=parse_crop(crop),
+            tile=tile,
+            window=window,
+            passes=passes,
+            skip=skip,
+            resume=resume,
+            quiet=quiet,
+            ended=ended,
+        )
     if json:
         report = Report()
         report.add(Row("frames", done.frames))
+        report.add(Row("frames restored by an earlier run", done.resumed))
         report.add(Row("height", done.height, "pixel"))
         report.add(Row("width", done.width, "pixel"))
         report.add(Row("window", done.window, "frame"))
@@ -72,7 +87,31 @@ def restore(
         report.add(Row("tiles of windows that were clean", done.skipped.clean))
         report.add(Row("tiles of windows that had not changed", done.skipped.still))
         report.write(json)
+    if done.left_out and not quiet:
+        codecs = ", ".join(done.left_out)
+        print(f"turbnet restore: the sound ({codecs}) was left out, {output} does not take it", file=sys.stderr)
     if not quiet:
         frames = "1 frame" if done.frames == 1 else f"{done.frames} frames"
+        resumed = f", {done.resumed} of them by an earlier run" if done.resumed else ""
         spared = f", {done.skipped.saved:.0%} of the tiles skipped" if done.skipped.saved else ""
-        print(f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}")
+        print(
+            f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}{resumed}",
+            file=sys.stderr if output == STANDARD else sys.stdout,
+        )
+
+
+@contextmanager
+def _ended_by_interrupt() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C tells a source to end; a second one interrupts the command."""
+    ended = False
+
+    def end(number: int, frame: object) -> None:
+        nonlocal ended
+        ended = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield lambda: ended
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -31,7 +31,7 @@ class ClassicalMethod:
             raise InputError(f"there is no method {name}; the methods are {', '.join(METHODS)}")
         self._restore = METHODS[name]
         threads = available_cores() if threads is None else threads
-        self._cores = int(check_range("threads", threads, 1, 1024))
+        self.threads = int(check_range("threads", threads, 1, 1024))
         self.card = ModelCard(architecture=name, config={}, size_multiple=1, frames=WINDOW)
 
     def __call__(self, frames_BTCHW: np.ndarray, report: Callable[[float], object] = lambda share: None) -> np.ndarray:
@@ -39,6 +39,6 @@ class ClassicalMethod:
         restored = []
         for frames_TCHW in frames_BTCHW:
             linear = to_linear(np.ascontiguousarray(np.moveaxis(frames_TCHW, 1, -1), np.float32))
-            clear = self._restore(linear, self._cores, lambda share: report(share / len(frames_BTCHW)))
+            clear = self._restore(linear, self.threads, lambda share: report(share / len(frames_BTCHW)))
             restored.append(np.moveaxis(to_srgb(clear.clip(0, 1)), -1, 1))
         return np.stack(restored).astype(np.float32)

@@ -1,20 +1,27 @@
 """Clips through a released network or a classical method: file in, file out."""
 
-import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
+from itertools import chain, islice, pairwise
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
+from turbnet._version import __version__
 from turbnet.deploy.method import ClassicalMethod
 from turbnet.deploy.session import Carried, Model
+from turbnet.deploy.sidecar import Sidecar, identity
 from turbnet.deploy.skipping import Skipped, Skipping
 from turbnet.deploy.stream import stream, window_count
 from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
+from turbnet.media.live import STANDARD, is_live
 from turbnet.progress import progress_bar
 
 TILE, OVERLAP = 320, 32
@@ -31,6 +38,8 @@ class Restoration:
         seconds: wall-clock time from the first frame read to the last one written.
         network_seconds: the part of it spent inside the network or the method.
         skipped: what the network was spared.
+        left_out: codecs of the sound that the destination does not take.
+        resumed: the frames of them that an earlier run had restored.
     """
 
     frames: int
@@ -41,10 +50,12 @@ class Restoration:
     seconds: float
     network_seconds: float
     skipped: Skipped
+    left_out: list[str]
+    resumed: int
 
     @property
     def milliseconds_a_frame(self) -> float:
-        return 1e3 * self.seconds / self.frames
+        return 1e3 * self.seconds / max(self.frames - self.resumed, 1)
 
 
 def restore_frames(
@@ -165,11 +176,15 @@ def restore_clip(
     passes: int = 1,
     skip: bool = False,
     maps: Model | None = None,
+    resume: bool = False,
     quiet: bool = True,
+    ended: Callable[[], bool] = lambda: False,
 ) -> Restoration:
     """Restore the clip in the file `source` into the file `destination`, which appears whole or not at all.
 
     Args:
+        source: file, folder or pattern of images, `-` for standard input, a named pipe, a camera.
+        destination: as the ending says; `-` for standard output, which takes frame by frame.
         crop: (left, top, width, height), pixels; None: the whole frame.
         tile: greatest side of a tile, pixels.
         overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
@@ -177,41 +192,95 @@ def restore_clip(
         passes: how often; a second pass restores what the first one left, for blur stronger than a network can undo at once.
         skip: spare a model the tiles that need nothing, see `turbnet.deploy.skipping`.
         maps: with `skip`, the network that says what single frames need.
+        resume: keep restored frames beside the destination until it is whole, and go on with those that are there, see
+            `turbnet.deploy.sidecar`; the clip is the same, byte for byte.
         quiet: no progress bar on standard error.
+        ended: whether a pipe or a camera is to end; what has come in by then is restored and written.
 
     Raises:
         InputError: the source cannot be read, the destination cannot be written, a parameter is out of range.
     """
     tiling, window = tiling_of(model, tile, overlap), window_of(model, window)
     passes = int(check_range("passes", passes, 1, 8))
-    count, inside, start, skipped = 0, 0.0, time.perf_counter(), Skipped()
-    with (
-        open_clip(source, crop) as clip,
-        open_writer(destination, fps=clip.info.fps, grey=clip.info.grey) as writer,
-        progress_bar(quiet) as progress,
-    ):
+    step = window - window_overlap(window)
+    count, inside, start, skipped = 0, 0.0, perf_counter(), Skipped()
+    with ExitStack() as stack:
+        clip = stack.enter_context(open_clip(source, crop, model.threads, ended))
         info = clip.info
+        sidecar = None
+        if resume:
+            _check_resumable(Path(source), Path(destination), model, skip)
+            settings = {
+                "version": __version__,
+                "source": identity(Path(source)),
+                "crop": crop,
+                "network": model.digest if isinstance(model, Model) else model.card.architecture,
+                "tile": tiling.tile,
+                "overlap of tiles": tiling.overlap,
+                "window": window,
+                "passes": passes,
+            }
+            sidecar = stack.enter_context(Sidecar(Path(destination), settings, step, info.grey))
+        sound = stack.enter_context(clip.sound())
+        within = sidecar.folder if sidecar else None
+        writer = stack.enter_context(
+            open_writer(destination, info.fps, info.grey, model.threads, info.tick, sound, within)
+        )
+        progress = stack.enter_context(progress_bar(quiet))
         tiles = tiling.count(info.height, info.width)
-        windows = window_count(info.frames, window, window_overlap(window)) if info.frames else None
-        task = progress.add_task("restoring", total=windows and windows * tiles * passes)
+        kept = sidecar.frames if sidecar else 0
+        # Each pass starts a window early, to fade from, and drops what came out before the next one starts.
+        starts = [max(kept - step * (passes - number), 0) for number in range(passes + 1)]
+        windows = [window_count((info.frames or 0) - first, window, window_overlap(window)) for first in starts[:-1]]
+        task = progress.add_task("restoring", total=sum(windows) * tiles if info.frames else None)
 
         def timed(frames_BTCHW: np.ndarray, whole: Ready) -> np.ndarray:
             nonlocal inside
-            began = time.perf_counter()
+            began = perf_counter()
             if isinstance(whole, ClassicalMethod):  # a window of one takes minutes, so the bar moves within it
                 restored_BTCHW = whole(frames_BTCHW, lambda share: progress.advance(task, share))
             else:
                 restored_BTCHW = whole(frames_BTCHW)
                 progress.advance(task)
-            inside += time.perf_counter() - began
+            inside += perf_counter() - began
             return restored_BTCHW
 
-        frames: Iterable[np.ndarray] = clip
-        for _ in range(passes):
+        times: deque[Fraction | None] = deque()  # of the frames that have come in and not gone out
+
+        def incoming() -> Iterator[np.ndarray]:
+            for time, frame_HWC in clip.timed():
+                times.append(time)
+                yield frame_HWC
+
+        frames: Iterable[np.ndarray] = incoming()
+        if sidecar:
+            held = []
+            for restored_HWC, frame_HWC in zip(sidecar.kept(), frames, strict=False):  # the longer one last
+                if count >= starts[0]:
+                    held.append(frame_HWC)
+                writer.write(restored_HWC, times.popleft())
+                count += 1
+            frames = chain(held, frames)
+        for first, following in pairwise(starts):
             whole = ready(model, tiles, skipped if skip else None, maps)
-            frames = restore_frames(frames, partial(timed, whole=whole), tiling, window)
+            restored = restore_frames(frames, partial(timed, whole=whole), tiling, window)
+            frames = islice(restored, following - first, None)
+        if sidecar:
+            frames = stack.enter_context(closing(sidecar.keep(frames)))
         for frame_HWC in frames:
-            writer.write(frame_HWC)
+            writer.write(frame_HWC, times.popleft())
             count += 1
-    seconds = time.perf_counter() - start
-    return Restoration(count, info.height, info.width, min(window, count), tiles, seconds, inside, skipped)
+    seconds = perf_counter() - start
+    left_out = list(sound.left_out.values()) if sound else []
+    return Restoration(
+        count, info.height, info.width, min(window, count), tiles, seconds, inside, skipped, left_out, kept
+    )
+
+
+def _check_resumable(source: Path, destination: Path, model: Model | ClassicalMethod, skip: bool) -> None:
+    if is_live(source) or destination == STANDARD:
+        raise InputError("a pipe or a camera cannot be resumed; leave --resume out")
+    if model.card.carried:
+        raise InputError("a model that goes frame by frame carries the whole clip along; leave --resume out")
+    if skip:
+        raise InputError("what is skipped depends on all that came before; leave --resume or --skip out")

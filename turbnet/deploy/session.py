@@ -30,15 +30,16 @@ class Model:
     """
 
     def __init__(self, data: bytes, threads: int | None = None) -> None:
-        verify(data)
+        self.digest = verify(data)
+        self.threads = int(check_range("threads", available_cores() if threads is None else threads, 1, 1024))
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = int(
-            check_range("threads", available_cores() if threads is None else threads, 1, 1024)
-        )
+        options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4  # errors reach the user as InputError, not through onnxruntime's log
         # Activations that fade into denormal numbers slow a processor down tenfold.
         options.add_session_config_entry("session.set_denormal_as_zero", "1")
+        # Between two calls the cores belong to the decoder and the encoder, not to threads that spin.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors share no narrower base class

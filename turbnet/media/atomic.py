@@ -15,8 +15,10 @@ _WRITE_FAILURES = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` (same suffix); rename it to `path` on success, delete it on any failure.
+def atomic_path(path: str | Path, within: Path | None = None) -> Iterator[Path]:
+    """Yield a temporary path (same suffix); rename it to `path` on success, delete it on any failure.
+
+    It lies beside `path`, or in the folder `within`, which is on the same disk.
 
     What is written under the temporary path may be a file or a folder. A file replaces an existing file; a folder
     replaces only an empty one, so that nobody's pictures are lost. A link is followed, not replaced.
@@ -28,7 +30,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         InputError: as `check_output`, or the disk is full.
     """
     target = check_output(path)
-    temporary = target.parent / f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}"
+    temporary = (within or target.parent) / f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}"
     try:
         yield temporary
         if temporary.is_dir() and target.is_dir():

@@ -3,7 +3,9 @@
 A frame is float32 (H, W, 3), RGB in [0, 1], sRGB-encoded as stored; `turbnet.media.colour` makes it linear.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -11,19 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from turbnet.errors import InputError
-from turbnet.media.readers import ClipInfo, Frame, Source, open_source
+from turbnet.media.readers import ClipInfo, Frame, Source, TimedFrame, open_source
+from turbnet.media.sound import Sound
 from turbnet.media.writers import ClipWriter, open_writer, write_clip
 
 __all__ = ["ClipInfo", "ClipReader", "ClipWriter", "open_clip", "open_writer", "read_clip", "write_clip"]
 
 
 class ClipReader:
-    """A clip to iterate over, one frame in memory at a time; every iteration starts from the first frame."""
+    """A clip to iterate over, one frame in memory at a time; every iteration starts from the first frame, where it can."""
 
     def __init__(self, path: Path, source: Source, crop: tuple[int, int, int, int] | None) -> None:
         self.path = path
         self._source = source
-        self._pass: Generator[Frame, None, None] | None = None
+        self._pass: Generator[TimedFrame, None, None] | None = None
         whole = source.info
         left, top, width, height = crop or (0, 0, whole.width, whole.height)
         inside = left >= 0 and top >= 0 and left + width <= whole.width and top + height <= whole.height
@@ -33,21 +36,29 @@ class ClipReader:
                 f"which is {whole.width}x{whole.height} pixels"
             )
         self._window = slice(top, top + height), slice(left, left + width)
-        self.info = ClipInfo(whole.frames, height, width, whole.fps, whole.grey)
+        self.info = replace(whole, height=height, width=width)
 
     def __iter__(self) -> Iterator[Frame]:
+        return (frame for _, frame in self.timed())
+
+    def timed(self) -> Iterator[TimedFrame]:
+        """The frames, each after its time: seconds from the start of the clip, None where the kind carries none."""
         self._pass = self._frames()
         return self._pass
 
-    def _frames(self) -> Generator[Frame, None, None]:
+    def sound(self) -> AbstractContextManager[Sound | None]:
+        """The sound of the clip, opened; None if it has none."""
+        return self._source.sound()
+
+    def _frames(self) -> Generator[TimedFrame, None, None]:
         whole = self._source.info
-        for index, frame in enumerate(self._source.frames()):
+        for index, (time, frame) in enumerate(self._source.frames()):
             if frame.shape[:2] != (whole.height, whole.width):
                 raise InputError(
                     f"frame {index} of {self.path} is {frame.shape[1]}x{frame.shape[0]} pixels but the first is "
                     f"{whole.width}x{whole.height}; all frames must have one size"
                 )
-            yield np.ascontiguousarray(frame[self._window])
+            yield time, np.ascontiguousarray(frame[self._window])
 
     def __enter__(self) -> "ClipReader":
         return self
@@ -57,19 +68,27 @@ class ClipReader:
             self._pass.close()
 
 
-def open_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> ClipReader:
-    """Open an image, a folder of images, a GIF, a multi-page TIFF or a video for reading.
+def open_clip(
+    path: str | Path,
+    crop: tuple[int, int, int, int] | None = None,
+    threads: int | None = None,
+    ended: Callable[[], bool] = lambda: False,
+) -> ClipReader:
+    """Open an image, a folder of images, a GIF, a multi-page TIFF, a video, a pipe or a camera for reading.
 
     Args:
         path: file, folder, or pattern of image files such as `frames/*.tif`. Stills and TIFFs, which carry no rate, get
-            25 frames per second; a GIF's rate is that of its first frame.
+            25 frames per second; a GIF's rate is that of its first frame. Or `-` for standard input, a named pipe, or a
+            camera such as /dev/video0, which can be passed over once only.
         crop: (left, top, width, height) in pixels; None: the whole picture.
+        threads: of a video's decoder; None: all cores.
+        ended: whether a pipe or a camera is to end, asked again and again.
 
     Raises:
         InputError: the path is missing, empty, damaged or not a clip, its frames differ in size, or the crop does not
             lie inside the picture. Damage further on in the clip is raised when the iteration comes to it.
     """
-    return ClipReader(Path(path), open_source(Path(path)), crop)
+    return ClipReader(Path(path), open_source(Path(path), threads, ended), crop)
 
 
 def read_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -> tuple[NDArray[np.float32], ClipInfo]:
@@ -77,4 +96,4 @@ def read_clip(path: str | Path, crop: tuple[int, int, int, int] | None = None) -
     with open_clip(path, crop) as clip:
         frames_THWC = np.stack(list(clip))
         info = clip.info
-    return frames_THWC, ClipInfo(len(frames_THWC), info.height, info.width, info.fps, info.grey)
+    return frames_THWC, replace(info, frames=len(frames_THWC))

@@ -1,9 +1,13 @@
-"""Every kind of clip as a stream of float32 frames (H, W, 3), RGB in [0, 1], sRGB-encoded as stored.
+"""Every kind of clip as a stream of float32 frames (H, W, 3), RGB in [0, 1], sRGB-encoded as stored, and their times.
 
 A reader gives a `Source`: what the header says, and a function that starts a fresh pass over the frames, one frame in
-memory at a time. Broken files raise InputError, at the latest when the pass comes to the broken place:
+memory at a time; of a pipe or a camera there is one pass only. Where the kind carries times (a video, a GIF), each frame
+comes with its own, exact, in seconds from the start of the clip; with None elsewhere.
+
+Broken files raise InputError, at the latest when the pass comes to the broken place:
 
 - A still, a folder, a GIF or a TIFF that cannot be decoded to its end.
+- A stream from a pipe or a camera that FFmpeg does not know. What cannot be decoded later on is passed over, as players do.
 - A video whose decoder reports or conceals damage in a frame, or that ends before the frame count (MP4, MOV, AVI) or
   the duration (MKV, WebM, FLV; give or take two frames) that its header declares. A container that declares neither
   (MPEG, TS) is taken as it is.
@@ -17,21 +21,24 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
-import tifffile
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from turbnet.errors import InputError
+from turbnet.media.live import STANDARD, is_live, open_live
+from turbnet.media.sound import Sound, start_of
 
 Frame = NDArray[np.float32]
+TimedFrame = tuple[Fraction | None, Frame]
 
 IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 VIDEOS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".flv", ".ogv"}
@@ -48,25 +55,42 @@ _GREY_MODES = {"1", "L", "LA", "La", "F", "I", "I;16", "I;16L", "I;16B", "I;16N"
 
 @dataclass(frozen=True)
 class ClipInfo:
-    """What a clip's header says: `frames` (None: not declared), pixels, frames per second, stored in one channel."""
+    """What a clip's header says.
+
+    Args:
+        frames: how many; None: not declared.
+        height, width: pixels.
+        fps: frames per second, on average.
+        grey: stored in one channel.
+        tick: seconds, of which the frames' times are multiples; None: they carry no times.
+    """
 
     frames: int | None
     height: int
     width: int
     fps: float
     grey: bool
+    tick: Fraction | None = None
 
 
 @dataclass(frozen=True)
 class Source:
-    """A clip's header and a function that starts a pass over its frames."""
+    """A clip's header, a function that starts a pass over its frames and one that opens its sound, None if it has none."""
 
     info: ClipInfo
-    frames: Callable[[], Iterator[Frame]]
+    frames: Callable[[], Iterator[TimedFrame]]
+    sound: Callable[[], AbstractContextManager[Sound | None]] = nullcontext
 
 
-def open_source(path: Path) -> Source:
-    """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name."""
+def open_source(path: Path, threads: int | None = None, ended: Callable[[], bool] = lambda: False) -> Source:
+    """The reader for `path`: live, a folder, a pattern of images, a file known by its first bytes or, a video, by its name.
+
+    Args:
+        threads: a video decoder's; None: all cores.
+        ended: whether a pipe or a camera is to end, asked again and again.
+    """
+    if is_live(path):
+        return _live(path, threads, ended)
     if path.is_dir():
         return _folder(path)
     if not path.exists() and any(sign in path.name for sign in "*?["):
@@ -81,7 +105,7 @@ def open_source(path: Path) -> Source:
     if kind:
         return _pillow(path)
     if path.suffix.lower() in VIDEOS:
-        return _video(path)
+        return _video(path, threads)
     if path.suffix.lower() in IMAGES | {".gif"}:
         raise InputError(f"cannot read {path}: its content is not an image")
     raise InputError(
@@ -144,17 +168,20 @@ def _pillow(path: Path) -> Source:
         count = getattr(image, "n_frames", 1) if moving else 1
         # Players show a frame without a duration for a tenth of a second.
         fps = 1000.0 / (image.info.get("duration") or 100) if count > 1 else DEFAULT_FPS
-        info = ClipInfo(count, height, width, float(fps), _is_grey(image))
+        tick = Fraction(1, 1000) if count > 1 else None
+        info = ClipInfo(count, height, width, float(fps), _is_grey(image), tick)
         if image.format == "GIF" and not _bytes_at(path, -64, 64).rstrip(b"\0").endswith(b";"):
             raise InputError(f"{path} is truncated: a GIF's end marker is missing")
         if image.format == "PNG" and count == 1 and _bytes_at(path, 24, 1) == b"\x10":  # bits a channel
             return Source(info, lambda: _deep_png(path))
 
-    def frames() -> Iterator[Frame]:
+    def frames() -> Iterator[TimedFrame]:
+        milliseconds = 0
         with _reading(path), Image.open(path) as image:
             for index in range(count):
                 image.seek(index)
-                yield _rgb(_pillow_pixels(ImageOps.exif_transpose(image)), path)
+                yield Fraction(milliseconds, 1000), _rgb(_pillow_pixels(ImageOps.exif_transpose(image)), path)
+                milliseconds += round(image.info.get("duration") or 100)
 
     return Source(info, frames)
 
@@ -179,19 +206,21 @@ def _bytes_at(path: Path, offset: int, count: int) -> bytes:
         return file.read(count)
 
 
-def _deep_png(path: Path) -> Iterator[Frame]:
+def _deep_png(path: Path) -> Iterator[TimedFrame]:
     """A PNG of 16 bits a channel, which Pillow would cut to 8."""
     with _reading(path), av.open(_ffmpeg_name(path)) as container:
         frame = next(container.decode(video=0))
         # PyAV hands out every 16-bit format but grey with alpha as it is.
         pixels = frame.to_ndarray(format="rgba64le" if frame.format.name.startswith("ya") else None)
-        yield _rgb(pixels.astype(np.uint16), path)
+        yield None, _rgb(pixels.astype(np.uint16), path)
 
 
 # --- TIFF --------------------------------------------------------------------------------------------------------
 
 
 def _tiff(path: Path) -> Source:
+    import tifffile  # a tenth of the start of a command that may never see one
+
     # Its warnings about a damaged file would stand beside our one line.
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
     with _reading(path), tifffile.TiffFile(path) as tiff:
@@ -204,11 +233,11 @@ def _tiff(path: Path) -> Source:
         height, width = first.imagelength, first.imagewidth
         info = ClipInfo(len(pages), height, width, DEFAULT_FPS, first.samplesperpixel <= 2 and first.photometric < 2)
 
-    def frames() -> Iterator[Frame]:
+    def frames() -> Iterator[TimedFrame]:
         with _reading(path), tifffile.TiffFile(path) as tiff:
             for index, page in enumerate(tiff.pages):
                 if not _is_thumbnail(page):
-                    yield _rgb(_tiff_pixels(path, page, index), path)
+                    yield None, _rgb(_tiff_pixels(path, page, index), path)
 
     return Source(info, frames)
 
@@ -218,6 +247,8 @@ def _is_thumbnail(page: Any) -> bool:
 
 
 def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
+    import tifffile
+
     page = page.aspage()
     if page.photometric in (tifffile.PHOTOMETRIC.PALETTE, tifffile.PHOTOMETRIC.YCBCR) or page.compression not in (
         tifffile.COMPRESSION.NONE,
@@ -272,9 +303,10 @@ def _sequence(pictures: list[Path], path: Path) -> Source:
                 f"pick them by a pattern such as '{picture.parent}/*{pictures[0].suffix}'"
             )
 
-    def frames() -> Iterator[Frame]:
+    def frames() -> Iterator[TimedFrame]:
         for picture in pictures:
-            yield from _still(picture).frames()
+            for _, frame in _still(picture).frames():
+                yield None, frame
 
     grey = all(info.grey for info in infos)
     return Source(ClipInfo(len(pictures), first.height, first.width, DEFAULT_FPS, grey), frames)
@@ -290,23 +322,87 @@ def _still(path: Path) -> Source:
 # --- video -------------------------------------------------------------------------------------------------------
 
 
-def _video(path: Path) -> Source:
+def _video(path: Path, threads: int | None) -> Source:
     with _reading(path), av.open(_ffmpeg_name(path)) as container:
-        stream = _video_stream(container, path)
-        context = stream.codec_context
+        stream = _video_stream(container, path, threads)
         frame = next(container.decode(stream), None)
         if frame is None:
             raise InputError(f"{path} holds no video frame")
         height, width = (frame.width, frame.height) if frame.rotation % 180 else (frame.height, frame.width)
         rate = stream.average_rate or stream.guessed_rate
-        grey = context.pix_fmt is not None and context.pix_fmt.startswith("gray")
-        info = ClipInfo(stream.frames or None, height, width, float(rate or DEFAULT_FPS), grey)
+        fps = float(rate or DEFAULT_FPS)
+        info = ClipInfo(stream.frames or None, height, width, fps, _is_grey_video(stream), stream.time_base)
 
-    def frames() -> Iterator[Frame]:
+    def frames() -> Iterator[TimedFrame]:
         with _reading(path), av.open(_ffmpeg_name(path)) as container:
-            yield from _decode(container, path)
+            yield from _decode(container, path, threads)
 
-    return Source(info, frames)
+    return Source(info, frames, lambda: _sound(path))
+
+
+@contextmanager
+def _sound(path: Path) -> Iterator[Sound | None]:
+    with _reading(path):
+        container = av.open(_ffmpeg_name(path))
+    with container:
+        yield Sound(container, _sound_packets(container, path)) if container.streams.audio else None
+
+
+def _sound_packets(container: Any, path: Path) -> Iterator[Any]:
+    with _reading(path):
+        for packet in container.demux(container.streams.audio):
+            if packet.dts is not None:  # but for the empty one at the end
+                yield packet
+
+
+def _live(path: Path, threads: int | None, ended: Callable[[], bool]) -> Source:
+    name = Path("standard input") if path == STANDARD else path
+    with _reading(name):
+        container = open_live(path, ended)
+        stream = _video_stream(container, name, threads)
+        sound = Sound(container) if container.streams.audio else None
+        following = _decode_live(container, sound, name, threads, ended)
+        first = next(following, None)
+    if first is None:
+        raise InputError(f"{name} holds no video frame")
+    height, width = first[1].shape[:2]
+    rate = stream.average_rate or stream.guessed_rate
+    info = ClipInfo(None, height, width, float(rate or DEFAULT_FPS), _is_grey_video(stream), stream.time_base)
+    heard = False
+
+    def listen() -> AbstractContextManager[Sound | None]:
+        nonlocal heard
+        heard = True
+        return nullcontext(sound)
+
+    def frames() -> Iterator[TimedFrame]:
+        if sound and not heard:
+            sound.mute()
+        yield first
+        yield from following
+
+    return Source(info, frames, listen)
+
+
+def _decode_live(
+    container: Any, sound: Sound | None, path: Path, threads: int | None, ended: Callable[[], bool]
+) -> Iterator[TimedFrame]:
+    stream, start = _video_stream(container, path, threads), start_of(container)
+    with _reading(path), container:
+        for packet in container.demux([stream, *container.streams.audio]):
+            if ended():
+                return
+            if sound and packet.stream_index != stream.index:
+                if packet.dts is not None:  # but for the empty one at the end
+                    sound.waiting.append(packet)
+                continue
+            with suppress(av.FFmpegError):
+                for frame in packet.decode():
+                    yield _video_time(frame, start), _video_pixels(frame, path)
+
+
+def _is_grey_video(stream: Any) -> bool:
+    return (stream.codec_context.pix_fmt or "").startswith("gray")
 
 
 def _ffmpeg_name(path: Path) -> str:
@@ -314,16 +410,17 @@ def _ffmpeg_name(path: Path) -> str:
     return str(path.absolute())
 
 
-def _video_stream(container: Any, path: Path) -> Any:
+def _video_stream(container: Any, path: Path, threads: int | None) -> Any:
     if not container.streams.video:
         raise InputError(f"{path} holds no video")
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
+    stream.codec_context.thread_count = threads or 0  # FFmpeg's 0 is all cores
     return stream
 
 
-def _decode(container: Any, path: Path) -> Iterator[Frame]:
-    stream = _video_stream(container, path)
+def _decode(container: Any, path: Path, threads: int | None) -> Iterator[TimedFrame]:
+    stream, start = _video_stream(container, path, threads), start_of(container)
     interval = 1 / float(stream.average_rate or DEFAULT_FPS)
     packets, count, end = 0, 0, 0.0
     for packet in container.demux(stream):
@@ -333,7 +430,7 @@ def _decode(container: Any, path: Path) -> Iterator[Frame]:
                 raise InputError(f"{path} is damaged near frame {count}")
             count += 1
             end = max(end, (frame.time or 0.0) + interval)
-            yield _video_pixels(frame, path)
+            yield _video_time(frame, start), _video_pixels(frame, path)
     if packets < stream.frames:
         raise InputError(f"{path} is truncated: its header says {stream.frames} frames, {packets} are there")
     duration = _declared_duration(container, stream)
@@ -351,18 +448,23 @@ def _declared_duration(container: Any, stream: Any) -> float:
     return container.duration / av.time_base if container.duration and len(container.streams) == 1 else 0.0
 
 
+def _video_time(frame: Any, start: Fraction) -> Fraction | None:
+    return None if frame.pts is None else frame.pts * frame.time_base - start
+
+
 def _video_pixels(frame: Any, path: Path) -> Frame:
+    # On one thread: PyAV would start new ones for each frame.
     bits = max(component.bits for component in frame.format.components)
     if frame.format.name == "gray":
         pixels = frame.to_ndarray()
     elif bits <= 8:
-        pixels = frame.reformat(format="rgb24", interpolation=_ACCURATE).to_ndarray()
+        pixels = frame.reformat(format="rgb24", interpolation=_ACCURATE, threads=1).to_ndarray()
     else:
         # FFmpeg brings deep YUV's white to 255 * 256, and n bits of grey by a shift to the upper end of 16.
         yuv = len(frame.format.components) > 1 and not frame.format.is_rgb
         shifted = ((1 << bits) - 1) << (16 - bits) if frame.format.name.startswith("gray") else 65535
         white = np.float32(255 * 256 if yuv else shifted)
-        pixels = frame.reformat(format="rgb48le", interpolation=_ACCURATE).to_ndarray()
+        pixels = frame.reformat(format="rgb48le", interpolation=_ACCURATE, threads=1).to_ndarray()
         pixels = np.minimum(pixels / white, np.float32(1))
     # A display rotation counts anticlockwise, as NumPy's does.
     return _rgb(np.rot90(pixels, frame.rotation // 90), path)
