@@ -1,10 +1,15 @@
 """A point of the measured curve for a time or a quality."""
 
+import json
+
+import numpy as np
 import pytest
 
+from turbnet.cli import run
 from turbnet.deploy import budget
 from turbnet.deploy.budget import Setting
 from turbnet.errors import InputError
+from turbnet.media.clip import write_clip
 
 POINTS = [Setting("s", 1, 1.0, 1.0), Setting("s", 8, 4.0, 2.0), Setting("s", 32, 6.0, 4.0)]
 
@@ -46,3 +51,28 @@ def test_what_nothing_can_do():
 
 def test_this_machine_takes_some_time():
     assert 0.05 < budget.seconds_here(Setting("s", 1, 0.0, 0.0), threads=1) < 1000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--quality", "99"], "the most is 6.0 dB"),
+        (["--quality", "1", "--budget-ms", "5"], "not both"),
+        (["--quality", "1", "--model", "s"], "leave --model"),
+        (["--budget-ms", "1e-6"], "at the least"),
+    ],
+)
+def test_the_command_line_says_what_cannot_be(arguments, complaint, tmp_path, capsys):
+    write_clip(tmp_path / "in.png", np.full((1, 16, 16, 3), 0.5, np.float32))
+    assert run(["restore", str(tmp_path / "in.png"), "-o", str(tmp_path / "out.png"), *arguments]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_the_command_line_restores_as_chosen(tmp_path):
+    write_clip(tmp_path / "in.mkv", np.full((3, 32, 32, 3), 0.5, np.float32))
+    report = tmp_path / "report.json"
+    command = ["restore", str(tmp_path / "in.mkv"), "-o", str(tmp_path / "out.mkv"), "--quality", "1", "--quiet"]
+    assert run([*command, "--json", str(report)]) == 0
+    rows = {row["name"]: row["value"] for row in json.loads(report.read_text())["rows"]}
+    assert rows["window"] == 1

@@ -28,6 +28,12 @@ def restore(
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="a method without learning in place of a model: pipeline, ...")
     ] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option("--budget-ms", metavar="MS", help="the best network and window for so long a frame")
+    ] = None,
+    quality: Annotated[
+        float | None, typer.Option(metavar="DB", help="the cheapest ones that gain so much on the benchmark")
+    ] = None,
     crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
     passes: Annotated[
@@ -49,7 +55,7 @@ def restore(
     from turbnet.deploy.method import ClassicalMethod
     from turbnet.deploy.restore import restore_clip
     from turbnet.deploy.session import Model
-    from turbnet.deploy.weights import DEFAULT, find_model
+    from turbnet.deploy.weights import DEFAULT, find_model, released_maps
     from turbnet.errors import InputError
     from turbnet.media.atomic import check_output
     from turbnet.media.live import STANDARD, is_live
@@ -59,6 +65,8 @@ def restore(
         raise InputError("give --model or --method, not both")
     if json:
         check_output(json)
+    if budget_ms is not None or quality is not None:
+        model, window = _chosen(source, crop, budget_ms, quality, threads, fixed=(model, method, window))
     network = ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads)
     with _ended_by_interrupt() if is_live(source) else nullcontext(lambda: False) as ended:
         done = restore_clip(
@@ -70,6 +78,7 @@ def restore(
             window=window,
             passes=passes,
             skip=skip,
+            maps=Model.load(released_maps(), threads) if skip and released_maps().is_file() else None,
             resume=resume,
             quiet=quiet,
             ended=ended,
@@ -98,6 +107,35 @@ def restore(
             f"{output}: {frames} of {done.width}x{done.height}, {done.milliseconds_a_frame:.0f} ms a frame{spared}{resumed}",
             file=sys.stderr if output == STANDARD else sys.stdout,
         )
+
+
+def _chosen(
+    source: Path,
+    crop: str | None,
+    budget_ms: float | None,
+    quality: float | None,
+    threads: int | None,
+    fixed: tuple[object, ...],
+) -> tuple[str, int]:
+    """Network and window for a time or a quality."""
+    from turbnet.cli.options import parse_crop
+    from turbnet.deploy.budget import for_budget, for_quality
+    from turbnet.errors import InputError
+    from turbnet.media.clip import open_clip
+    from turbnet.media.live import is_live
+
+    if budget_ms is not None and quality is not None:
+        raise InputError("give --budget-ms or --quality, not both")
+    if any(value is not None for value in fixed):
+        raise InputError("--budget-ms and --quality choose model and window: leave --model, --method and --window out")
+    if quality is not None:
+        point = for_quality(quality)
+    elif budget_ms is not None:
+        if is_live(source):
+            raise InputError("--budget-ms needs to know the size of the frames beforehand: not of a pipe or a camera")
+        with open_clip(source, parse_crop(crop)) as clip:
+            point = for_budget(budget_ms, clip.info.height, clip.info.width, threads)
+    return point.model, point.window
 
 
 @contextmanager
