@@ -10,14 +10,18 @@ memory at a time. Broken files raise InputError, at the latest when the pass com
 
 Damage that decodes to a valid picture, as within uncompressed pixels or VP8, cannot be told from the picture.
 
-Decoders meet damaged files with whatever exception the damage leads to, hence the broad net in `_reading`.
+A file is what its bytes say and stands for itself alone: playlists and scripts, which FFmpeg would follow to other files and
+addresses, are refused, and so is what declares more pixels than `turbnet.media.guard.LARGEST`.
 """
 
 import logging
+import lzma
+import math
 import os
 import re
+import warnings
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +34,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from turbnet.errors import InputError
+from turbnet.media.guard import LARGEST, check_size, reading
 
 Frame = NDArray[np.float32]
 
@@ -43,6 +48,12 @@ _LARGEST_FLOAT = 2.0
 _ACCURATE = (
     Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
 )
+# Containers of one file each, and no protocol but files: a playlist named clip.mp4 reads nothing else.
+_ALONE = {
+    "format_whitelist": "mov,avi,matroska,mpeg,mpegvideo,mpegts,asf,flv,ogg,png_pipe",
+    "protocol_whitelist": "file",
+}
+_PILLOW = ("PNG", "JPEG", "BMP", "GIF", "WEBP")
 _GREY_MODES = {"1", "L", "LA", "La", "F", "I", "I;16", "I;16L", "I;16B", "I;16N"}
 
 
@@ -69,12 +80,13 @@ def open_source(path: Path) -> Source:
     """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name."""
     if path.is_dir():
         return _folder(path)
-    if not path.exists() and any(sign in path.name for sign in "*?["):
-        return _sequence([picture for picture in path.parent.glob(path.name) if picture.is_file()], path)
-    if not path.exists():
-        raise InputError(f"there is no file or folder {path}")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty (0 bytes)")
+    with reading(path):  # a name may be too long, a pattern may be none
+        if not path.exists():
+            if any(sign in path.name for sign in "*?["):
+                return _sequence([picture for picture in path.parent.glob(path.name) if picture.is_file()], path)
+            raise InputError(f"there is no file or folder {path}")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path} is empty (0 bytes)")
     kind = _image_kind(path)
     if kind == "tiff":
         return _tiff(path)
@@ -90,19 +102,8 @@ def open_source(path: Path) -> Source:
     )
 
 
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise InputError(f"cannot read {path}: {' '.join(reason.split())}") from error
-
-
 def _image_kind(path: Path) -> str | None:
-    with _reading(path):
+    with reading(path):
         start = _bytes_at(path, 0, 16)
     if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return "tiff"
@@ -137,7 +138,7 @@ def _rgb(pixels: NDArray[Any], path: Path) -> Frame:
 
 
 def _pillow(path: Path) -> Source:
-    with _reading(path), Image.open(path) as image:
+    with reading(path), _open_image(path, _PILLOW) as image:
         turned = image.getexif().get(ExifTags.Base.Orientation, 1) > 4
         height, width = image.size if turned else image.size[::-1]
         moving = image.format in ("GIF", "WEBP", "PNG")
@@ -151,12 +152,20 @@ def _pillow(path: Path) -> Source:
             return Source(info, lambda: _deep_png(path))
 
     def frames() -> Iterator[Frame]:
-        with _reading(path), Image.open(path) as image:
+        with reading(path), _open_image(path, _PILLOW) as image:
             for index in range(count):
                 image.seek(index)
                 yield _rgb(_pillow_pixels(ImageOps.exif_transpose(image)), path)
 
     return Source(info, frames)
+
+
+def _open_image(path: Path, formats: tuple[str, ...]) -> Image.Image:
+    # Pillow warns of two thirds of our largest picture: lines beside ours, or none of the caller's.
+    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+    image = Image.open(path, formats=formats)
+    check_size(path, image.height, image.width)
+    return image
 
 
 def _pillow_pixels(image: Image.Image) -> NDArray[Any]:
@@ -181,7 +190,7 @@ def _bytes_at(path: Path, offset: int, count: int) -> bytes:
 
 def _deep_png(path: Path) -> Iterator[Frame]:
     """A PNG of 16 bits a channel, which Pillow would cut to 8."""
-    with _reading(path), av.open(_ffmpeg_name(path)) as container:
+    with reading(path), _open_video(path) as container:
         frame = next(container.decode(video=0))
         # PyAV hands out every 16-bit format but grey with alpha as it is.
         pixels = frame.to_ndarray(format="rgba64le" if frame.format.name.startswith("ya") else None)
@@ -194,7 +203,7 @@ def _deep_png(path: Path) -> Iterator[Frame]:
 def _tiff(path: Path) -> Source:
     # Its warnings about a damaged file would stand beside our one line.
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
-    with _reading(path), tifffile.TiffFile(path) as tiff:
+    with reading(path), tifffile.TiffFile(path) as tiff:
         pages = [page for page in tiff.pages if not _is_thumbnail(page)]
         if not pages:
             raise InputError(f"{path} holds no picture")
@@ -205,7 +214,7 @@ def _tiff(path: Path) -> Source:
         info = ClipInfo(len(pages), height, width, DEFAULT_FPS, first.samplesperpixel <= 2 and first.photometric < 2)
 
     def frames() -> Iterator[Frame]:
-        with _reading(path), tifffile.TiffFile(path) as tiff:
+        with reading(path), tifffile.TiffFile(path) as tiff:
             for index, page in enumerate(tiff.pages):
                 if not _is_thumbnail(page):
                     yield _rgb(_tiff_pixels(path, page, index), path)
@@ -219,6 +228,7 @@ def _is_thumbnail(page: Any) -> bool:
 
 def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
     page = page.aspage()
+    check_size(path, page.imagelength, page.imagewidth)
     if page.photometric in (tifffile.PHOTOMETRIC.PALETTE, tifffile.PHOTOMETRIC.YCBCR) or page.compression not in (
         tifffile.COMPRESSION.NONE,
         tifffile.COMPRESSION.ADOBE_DEFLATE,
@@ -228,15 +238,33 @@ def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
         # LZW, JPEG and the like: libtiff through Pillow, which keeps 16 bits in grey only.
         if page.bitspersample > 8 and page.samplesperpixel > 1:
             raise InputError(f"cannot read {path}: save a compressed TIFF of over 8 bits a channel uncompressed")
-        with Image.open(path) as image:
+        with _open_image(path, ("TIFF",)) as image:
             image.seek(index)
             return _pillow_pixels(image)
+    _check_inflated(path, page)
     pixels = page.asarray()
     if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and pixels.ndim == 3:
         pixels = np.moveaxis(pixels, 0, -1)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
         pixels = ~pixels if pixels.dtype.kind in "ub" else 1 - pixels
     return pixels
+
+
+def _check_inflated(path: Path, page: Any) -> None:
+    """Raise InputError if a page has too many channels, or a strip inflates to more than a picture: tifffile would let it."""
+    if page.samplesperpixel > 4 or page.bitspersample > 64:
+        raise InputError(f"cannot read {path}: {page.samplesperpixel} channels are neither grey nor RGB")
+    height, width = (page.tilelength, page.tilewidth) if page.is_tiled else (page.imagelength, page.imagewidth)
+    check_size(path, height, width)
+    if page.compression == tifffile.COMPRESSION.NONE:
+        return
+    most = 1 + height * width * page.samplesperpixel * page.bitspersample // 8
+    with path.open("rb") as file:
+        for start, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(start)
+            unpack = lzma.LZMADecompressor() if page.compression == tifffile.COMPRESSION.LZMA else zlib.decompressobj()
+            if len(unpack.decompress(file.read(count), most)) == most:
+                raise InputError(f"cannot read {path}: it inflates to more than its pixels")
 
 
 # --- folders -----------------------------------------------------------------------------------------------------
@@ -247,7 +275,7 @@ def _natural(path: Path) -> list[str | int]:
 
 
 def _folder(path: Path) -> Source:
-    with _reading(path):
+    with reading(path):
         entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     if not entries:
         raise InputError(f"the folder {path} is empty")
@@ -291,7 +319,7 @@ def _still(path: Path) -> Source:
 
 
 def _video(path: Path) -> Source:
-    with _reading(path), av.open(_ffmpeg_name(path)) as container:
+    with reading(path), _open_video(path) as container:
         stream = _video_stream(container, path)
         context = stream.codec_context
         frame = next(container.decode(stream), None)
@@ -303,21 +331,23 @@ def _video(path: Path) -> Source:
         info = ClipInfo(stream.frames or None, height, width, float(rate or DEFAULT_FPS), grey)
 
     def frames() -> Iterator[Frame]:
-        with _reading(path), av.open(_ffmpeg_name(path)) as container:
+        with reading(path), _open_video(path) as container:
             yield from _decode(container, path)
 
     return Source(info, frames)
 
 
-def _ffmpeg_name(path: Path) -> str:
-    """Absolute, so that FFmpeg never takes what precedes a colon for a protocol."""
-    return str(path.absolute())
+def _open_video(path: Path) -> Any:
+    # An absolute name, so that FFmpeg never takes what precedes a colon for a protocol.
+    return av.open(str(path.absolute()), options=_ALONE)
 
 
 def _video_stream(container: Any, path: Path) -> Any:
     if not container.streams.video:
         raise InputError(f"{path} holds no video")
     stream = container.streams.video[0]
+    check_size(path, stream.height, stream.width)
+    stream.codec_context.options = {"max_pixels": str(LARGEST)}  # pictures may be larger than the container says
     stream.thread_type = "AUTO"
     return stream
 
