@@ -45,7 +45,9 @@ def main(arguments: list[str]) -> int:
 
     sys.argv = ["turbnet train", *arguments]
     try:
-        with patch.object(Hydra, "compose_config", compose_checked):  # before Hydra acts on what a file may have told it
+        with patch.object(
+            Hydra, "compose_config", compose_checked
+        ):  # before Hydra acts on what a file may have told it
             run()
     except refused as error:
         raise _in_words(error) from error

@@ -57,7 +57,9 @@ def packed_pictures(path: Path) -> list[PackedPicture]:
                 if item.compress_type != zipfile.ZIP_STORED or not item.filename.endswith(".webp"):
                     raise InputError(f"{path} is not a pack of tools/pack_pictures.py: it holds {item.filename}")
                 if item.file_size > whole:
-                    raise InputError(f"cannot read the pack {path}: {item.filename} claims more bytes than the file has")
+                    raise InputError(
+                        f"cannot read the pack {path}: {item.filename} claims more bytes than the file has"
+                    )
                 file.seek(item.header_offset)
                 header = file.read(_LOCAL_HEADER)
                 names = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")

@@ -53,7 +53,11 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     if not (_is_whole(count) and _is_whole(size) and size and isinstance(shards, list) and "complete" in manifest):
         raise InputError(f"{path} is damaged: it does not say how many samples and shards there are")
     for record in shards:
-        known = isinstance(record, dict) and [*map(type, map(record.get, ("file", "bytes", "sha256")))] == [str, int, str]
+        known = isinstance(record, dict) and [*map(type, map(record.get, ("file", "bytes", "sha256")))] == [
+            str,
+            int,
+            str,
+        ]
         if not known or not _SHARD.fullmatch(record["file"]):  # a name with folders in it would lead elsewhere
             raise InputError(f"{path} is damaged: {record!r:.200} describes no shard")
     return manifest

@@ -4,7 +4,7 @@ The metadata entry `turbnet.sha256` is written as 64 zeros, the bytes of the who
 replaced by the digest. Checking goes the same way back, on the bytes alone and before any parser sees them: find the
 entry, put the zeros back, hash, compare. The seal tells a damaged or altered file from a whole one; it is no signature.
 
-What is sealed is all there is: a file that keeps weights elsewhere, as ONNX allows, is refused, or its seal would say nothing
+What is sealed is all there is: a file that keeps weights elsewhere, as ONNX allows, is refused: its seal would say nothing
 of them, and reading it would read whatever file it names.
 """
 
@@ -19,8 +19,8 @@ UNSEALED = "0" * 64
 # A StringStringEntryProto: field 1 (tag 0x0a), length, key; field 2 (tag 0x12), length 64, value.
 _ENTRY = re.compile(b"\x0a" + bytes([len(KEY)]) + re.escape(KEY.encode()) + rb"\x12\x40([0-9a-f]{64})")
 
-# External data, a TensorProto's field, is a list of such entries of which one has the key "location"; a protobuf string comes
-# after its length, 8, which may be written in more bytes than one.
+# External data, a field of TensorProto, is a list of such entries of which one has the key "location"; a protobuf string
+# comes after its length, 8, which may be written in more bytes than one.
 _ELSEWHERE = re.compile(rb"(?:\x08|\x88\x80{0,8}\x00)location")
 
 

@@ -16,7 +16,6 @@ addresses, are refused, and so is what declares more pixels than `turbnet.media.
 
 import logging
 import lzma
-import math
 import os
 import re
 import warnings
@@ -78,9 +77,9 @@ class Source:
 
 def open_source(path: Path) -> Source:
     """The reader for `path`: a folder or a pattern of images, a file known by its first bytes or, a video, by its name."""
-    if path.is_dir():
-        return _folder(path)
     with reading(path):  # a name may be too long, a pattern may be none
+        if path.is_dir():
+            return _folder(path)
         if not path.exists():
             if any(sign in path.name for sign in "*?["):
                 return _sequence([picture for picture in path.parent.glob(path.name) if picture.is_file()], path)
@@ -251,7 +250,7 @@ def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
 
 
 def _check_inflated(path: Path, page: Any) -> None:
-    """Raise InputError if a page has too many channels, or a strip inflates to more than a picture: tifffile would let it."""
+    """Raise InputError if a page has too many channels, or a strip inflates to more than a picture: tifffile lets it."""
     if page.samplesperpixel > 4 or page.bitspersample > 64:
         raise InputError(f"cannot read {path}: {page.samplesperpixel} channels are neither grey nor RGB")
     height, width = (page.tilelength, page.tilewidth) if page.is_tiled else (page.imagelength, page.imagewidth)

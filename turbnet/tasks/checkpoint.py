@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from turbnet.errors import InputError
+from turbnet.media.guard import reading
 from turbnet.weights.released import read_card, read_weights, released_networks
 
 
@@ -19,7 +20,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         InputError: there is no such file, it is no checkpoint, or it is none of ours.
     """
     path = Path(path)
-    if not path.is_file():
+    with reading(path):  # a name may be too long
+        found = path.is_file()
+    if not found:
         if str(path) in released_networks():
             return _released(str(path))
         names = ", ".join(released_networks()) or "none in this installation"

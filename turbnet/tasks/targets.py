@@ -13,7 +13,9 @@ ALLOWED = ("turbnet.data.", "turbnet.tasks.", *(f"lightning.pytorch.{part}." for
 
 _HYDRA = ("hydra.", "hydra_plugins.")
 _LAUNCHER = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
-_LOGGING = re.compile(r"logging\.(handlers\.)?\w*Handler|logging\.Formatter|colorlog\.ColoredFormatter|ext://sys\.std(out|err)")
+_LOGGING = re.compile(
+    r"logging\.(handlers\.)?\w*Handler|logging\.Formatter|colorlog\.ColoredFormatter|ext://sys\.std(out|err)"
+)
 
 
 def check_targets(config: Any, where: str = "config") -> None:
@@ -42,7 +44,9 @@ def check_hydra(config: Any) -> None:
         # What a cluster's launcher runs before a job stands in its settings.
         asked = any(override.startswith("hydra/launcher=") for override in config["overrides"]["hydra"])
         if name == "hydra.launcher._target_" and value != _LAUNCHER and not asked:
-            raise InputError(f"{name} = {value!r}: ask for another launcher on the command line, by hydra/launcher=NAME")
+            raise InputError(
+                f"{name} = {value!r}: ask for another launcher on the command line, by hydra/launcher=NAME"
+            )
 
 
 def _entries(config: Any, where: str) -> Any:
