@@ -101,6 +101,13 @@ def test_compressed_tiffs_still_open(tmp_path, compression):
     np.testing.assert_allclose(read_clip(tmp_path / "b.tif")[0], frames / 65535, atol=1e-6)
 
 
+def test_pages_that_run_in_a_circle(tmp_path):
+    data = tiff_of(8, 8, compression=1, data=bytes(64))
+    (tmp_path / "a.tif").write_bytes(data[:-4] + pack("<I", 8 + 64))
+    with pytest.raises(InputError, match="run in a circle"):
+        open_clip(tmp_path / "a.tif")
+
+
 SCRIPTS = {
     "concat": "ffconcat version 1.0\nfile secret.mkv\n",
     "hls": "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nsecret.mkv\n#EXT-X-ENDLIST\n",

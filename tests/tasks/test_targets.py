@@ -57,7 +57,9 @@ def test_a_pickle_is_no_run_to_repeat(refused, tmp_path):
         (tmp_path / "experiment").rmdir()
 
 
-@pytest.mark.parametrize("text", ["a: [1", "\t- x: {", "net: ${net", "[1, 2]", "x: &a [*a]"])
+@pytest.mark.parametrize(
+    "text", ["a: [1", "\t- x: {", "net: ${net", "[1, 2]", "x: &a [*a]", "x: " + "9" * 5000, "x: " + "[" * 5000]
+)
 def test_a_config_that_is_none(refused, text):
     assert refused(text=text).startswith("turbnet train: ")
 

@@ -20,16 +20,19 @@ def main(arguments: list[str]) -> int:
 
     from turbnet.tasks.targets import check_hydra
 
-    # The last three: of a file that is no YAML, no text, or nested without end.
-    damaged = (yaml.YAMLError, UnicodeError, RecursionError)
-    refused = (InputError, HydraException, OmegaConfBaseException, OSError, *damaged)
+    refused = (InputError, HydraException, OmegaConfBaseException, OSError)
     command = sys.argv[0]
     if any(argument.startswith("--e") for argument in arguments):  # argparse takes any beginning of the name
         raise InputError("--experimental-rerun would run what a pickle says; give the overrides of the run instead")
     compose = Hydra.compose_config
 
     def compose_checked(self: Hydra, *positional: Any, **more: Any) -> DictConfig:
-        config = compose(self, *positional, **more)
+        try:
+            config = compose(self, *positional, **more)
+        except refused:
+            raise
+        except (yaml.YAMLError, ValueError, RecursionError) as error:  # no YAML, no text, nested without end
+            raise InputError(f"a configuration cannot be read: {error}") from error
         check_hydra(OmegaConf.to_container(config.hydra, resolve=False))
         return config
 

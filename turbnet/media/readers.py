@@ -203,7 +203,7 @@ def _tiff(path: Path) -> Source:
     # Its warnings about a damaged file would stand beside our one line.
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
     with reading(path), tifffile.TiffFile(path) as tiff:
-        pages = [page for page in tiff.pages if not _is_thumbnail(page)]
+        pages = [page for _, page in _pages(path, tiff)]
         if not pages:
             raise InputError(f"{path} holds no picture")
         if tiff.series[0].is_truncated or tiff.series[0].keyframe.imagedepth > 1:
@@ -214,15 +214,21 @@ def _tiff(path: Path) -> Source:
 
     def frames() -> Iterator[Frame]:
         with reading(path), tifffile.TiffFile(path) as tiff:
-            for index, page in enumerate(tiff.pages):
-                if not _is_thumbnail(page):
-                    yield _rgb(_tiff_pixels(path, page, index), path)
+            for index, page in _pages(path, tiff):
+                yield _rgb(_tiff_pixels(path, page, index), path)
 
     return Source(info, frames)
 
 
-def _is_thumbnail(page: Any) -> bool:
-    return bool(page.keyframe.is_reduced)
+def _pages(path: Path, tiff: Any) -> Iterator[tuple[int, Any]]:
+    """Pages that are no thumbnails, by their number. Each says where the next one is, which may be an earlier one."""
+    seen: set[int] = set()
+    for index, page in enumerate(tiff.pages):
+        if page.offset in seen:
+            raise InputError(f"cannot read {path}: its pages run in a circle")
+        seen.add(page.offset)
+        if not page.keyframe.is_reduced:
+            yield index, page
 
 
 def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
