@@ -1,4 +1,8 @@
+import importlib.util
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -24,3 +28,13 @@ def trained() -> Callable[[dict], nn.Module]:
         return network.eval()
 
     return build_trained
+
+
+@pytest.fixture(scope="session")
+def fuzz() -> ModuleType:
+    """tools/fuzz.py, which makes spoiled files and reads them."""
+    spec = importlib.util.spec_from_file_location("fuzz", Path(__file__).parents[1] / "tools" / "fuzz.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["fuzz"] = module  # for its dataclass
+    spec.loader.exec_module(module)
+    return module

@@ -53,10 +53,10 @@ def test_a_pack_keeps_to_its_limit(folder, tmp_path):
 
 
 def test_what_is_no_pack(folder, tmp_path):
-    with pytest.raises(InputError, match=r"none\.zip cannot be read"):
+    with pytest.raises(InputError, match=r"cannot read the pack .*none\.zip"):
         folder_paths([tmp_path / "none.zip"])
     (tmp_path / "junk.zip").write_bytes(b"junk" * 100)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot read the pack"):
         folder_paths([tmp_path / "junk.zip"])
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("a.txt", "text")
@@ -77,7 +77,7 @@ def test_a_damaged_picture_in_a_pack(folder, tmp_path):
     data = bytearray(pack.read_bytes())
     data[first.start : first.start + first.size] = bytes(first.size)
     pack.write_bytes(data)
-    with pytest.raises(InputError, match=r"a picture in .*p\.zip cannot be read"):
+    with pytest.raises(InputError, match=r"cannot read a picture in .*p\.zip"):
         first.load()
 
 

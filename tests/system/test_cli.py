@@ -4,6 +4,7 @@ import sys
 import pytest
 
 import turbnet
+import turbnet.cli
 from turbnet.cli import VERBS
 
 
@@ -58,3 +59,20 @@ def test_importing_the_package_is_quick():
     script = "import sys, turbnet.cli; print([m for m in ('torch', 'numpy', 'typer', 'lightning') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["restore", "--help"], ["simulate", "--help"]])
+def test_help_costs_no_library(arguments):
+    heavy = "torch lightning onnxruntime av numpy scipy"
+    script = (
+        "import sys, turbnet.cli; turbnet.cli.run(sys.argv[2:])\n"
+        "print([name for name in sys.argv[1].split() if name in sys.modules], file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", script, heavy, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr.splitlines()[-1] == "[]"
+
+
+def test_an_error_steers_no_terminal(capsys):
+    assert turbnet.cli.run(["restore", "\x1b[2Jx.png", "-o", "out.png"]) == 2
+    assert "\x1b" not in capsys.readouterr().err

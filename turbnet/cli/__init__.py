@@ -44,11 +44,17 @@ def run(arguments: list[str]) -> int:
     try:
         return int(importlib.import_module(f"turbnet.cli.{verb}").main(arguments[1:]) or 0)
     except InputError as error:
-        print(f"turbnet {verb}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"turbnet {verb}: {_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"turbnet {verb}: interrupted", file=sys.stderr)
         return 130
+
+
+def _one_line(error: Exception) -> str:
+    """Its words alone: what a file says of itself may stand in them, and must not steer a terminal."""
+    text = " ".join(str(error).split())
+    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 def _help() -> str:

@@ -10,8 +10,10 @@ from pathlib import Path
 
 from turbnet.errors import InputError
 from turbnet.media.atomic import atomic_path
+from turbnet.media.guard import read_bytes, reading
 
 COLUMNS = ("file", "left", "top", "width", "height", "text")
+_LARGEST = 2**26  # bytes of a table
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,9 @@ def read_boxes(path: str | Path) -> dict[str, list[TextBox]]:
     Raises:
         InputError: names the table, the line and what is wrong with it.
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the boxes {path}: {getattr(error, 'strerror', None) or error}") from error
+    data = read_bytes(path, _LARGEST, "the boxes ")
+    with reading(f"the boxes {path}"):
+        lines = data.decode("utf-8").splitlines()
     rows = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     if not rows or tuple(rows[0][1].split("\t")) != COLUMNS:
         raise InputError(f"{path}: the first line must name the columns {' '.join(COLUMNS)}, with tabs between")

@@ -28,14 +28,13 @@ from torch.utils.data import DataLoader, Dataset
 
 from turbnet.data.clips import Scene
 from turbnet.data.pairs import PairMaker
-from turbnet.data.shards import FORMAT, MANIFEST, PICTURES, is_whole, read_manifest, shard_name, shard_rows
+from turbnet.data.shards import CONDITIONS, FORMAT, MANIFEST, PICTURES, is_whole, read_manifest, shard_name, shard_rows
 from turbnet.errors import InputError, check_range
 from turbnet.media.atomic import atomic_path, check_output
 from turbnet.progress import progress_bar
 
 Sample = dict[str, NDArray[Any]]
 
-_CONDITIONS = ("seed", "d_over_r0", "geometry", "wind", "read_noise", "full_well", "draw_seed", "noise_seed")
 _LEFTOVER = re.compile(r"\.(manifest|shard-\d+)\.[0-9a-f]+\.partial\.(json|safetensors)")
 
 
@@ -147,7 +146,8 @@ def _resume(folder: Path, manifest: dict[str, Any]) -> dict[int, dict[str, Any]]
                 "choose another folder, or repeat the command in its manifest to go on with it"
             )
     numbers = {shard_name(number): number for number in range(-(-manifest["count"] // manifest["shard_size"]))}
-    return {numbers[record["file"]]: record for record in found["shards"] if is_whole(folder, record)}
+    records = [record for record in found["shards"] if record["file"] in numbers]
+    return {numbers[record["file"]]: record for record in records if is_whole(folder, record)}
 
 
 def _short(value: Any) -> str:
@@ -223,7 +223,7 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
 def _table(folder: Path, manifest: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
     """The samples of a shard as rows of the manifest's table; JSON has no infinity and no NaN: both are null."""
     with safe_open(folder / shard_name(number), framework="np") as shard:
-        columns = {name: shard.get_tensor(name).tolist() for name in _CONDITIONS}
+        columns = {name: shard.get_tensor(name).tolist() for name in CONDITIONS}
     for row, index in enumerate(shard_rows(manifest, number)):
         values = {name: column[row] for name, column in columns.items()}
         if math.isnan(values["wind"][0]):

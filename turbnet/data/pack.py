@@ -16,6 +16,7 @@ from PIL import Image
 from turbnet.errors import InputError, check_range
 from turbnet.media.atomic import atomic_path
 from turbnet.media.clip import open_clip
+from turbnet.media.guard import reading
 
 SUFFIX = ".zip"
 _LOCAL_HEADER = 30  # bytes, before name and extra field
@@ -34,14 +35,12 @@ class PackedPicture(NamedTuple):
         Raises:
             InputError: it is damaged.
         """
-        try:
+        with reading(f"a picture in {self.pack}"):
             with self.pack.open("rb") as file:
                 file.seek(self.start)
                 data = file.read(self.size)
             with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
                 return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
-        except (OSError, ValueError) as error:
-            raise InputError(f"a picture in {self.pack} cannot be read: {error}") from error
 
 
 def packed_pictures(path: Path) -> list[PackedPicture]:
@@ -51,17 +50,20 @@ def packed_pictures(path: Path) -> list[PackedPicture]:
         InputError: it is missing, damaged, or no pack.
     """
     found = []
-    try:
+    with reading(f"the pack {path}"):
+        whole = path.stat().st_size
         with zipfile.ZipFile(path) as archive, path.open("rb") as file:
             for item in archive.infolist():
                 if item.compress_type != zipfile.ZIP_STORED or not item.filename.endswith(".webp"):
                     raise InputError(f"{path} is not a pack of tools/pack_pictures.py: it holds {item.filename}")
+                if item.file_size > whole:
+                    raise InputError(
+                        f"cannot read the pack {path}: {item.filename} claims more bytes than the file has"
+                    )
                 file.seek(item.header_offset)
                 header = file.read(_LOCAL_HEADER)
                 names = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")
                 found.append(PackedPicture(path, item.header_offset + _LOCAL_HEADER + names, item.file_size))
-    except (OSError, zipfile.BadZipFile) as error:
-        raise InputError(f"the pack {path} cannot be read: {error}") from error
     if not found:
         raise InputError(f"no pictures in {path}")
     return found

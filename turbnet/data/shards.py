@@ -15,7 +15,7 @@ tensors give the same bytes, and readers exist for NumPy, torch, JAX, TensorFlow
 """
 
 import hashlib
-import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,15 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from turbnet.errors import InputError
+from turbnet.media.guard import read_json
 from turbnet.progress import progress_bar
 from turbnet.report import Row
 
 MANIFEST = "manifest.json"
 FORMAT = "turbnet dataset 1"
 PICTURES = ("frames", "target", "blur_only")
+CONDITIONS = ("seed", "d_over_r0", "geometry", "wind", "read_noise", "full_well", "draw_seed", "noise_seed")
+_SHARD = re.compile(r"shard-\d{5,}\.safetensors")
 
 
 def read_manifest(folder: str | Path) -> dict[str, Any]:
@@ -43,13 +46,25 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     path = Path(folder) / MANIFEST
     if not path.is_file():
         raise InputError(f"there is no dataset in {folder}: it holds no {MANIFEST}")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {error}") from error
+    manifest = read_json(path)
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise InputError(f"{path} is not the manifest of a dataset of turbnet ({FORMAT})")
+    count, size, shards = (manifest.get(name) for name in ("count", "shard_size", "shards"))
+    if not (_is_whole(count) and _is_whole(size) and size and isinstance(shards, list) and "complete" in manifest):
+        raise InputError(f"{path} is damaged: it does not say how many samples and shards there are")
+    for record in shards:
+        known = isinstance(record, dict) and [*map(type, map(record.get, ("file", "bytes", "sha256")))] == [
+            str,
+            int,
+            str,
+        ]
+        if not known or not _SHARD.fullmatch(record["file"]):  # a name with folders in it would lead elsewhere
+            raise InputError(f"{path} is damaged: {record!r:.200} describes no shard")
     return manifest
+
+
+def _is_whole(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**53
 
 
 def shard_name(number: int) -> str:
@@ -115,8 +130,10 @@ class Shards(Dataset[dict[str, Tensor]]):
         path = self.folder / shard_name(number)
         try:
             with safe_open(path, framework="pt") as shard:
-                sample = {name: shard.get_slice(name)[row] for name in shard.keys()}  # noqa: SIM118 (it is no dict)
-        except (OSError, SafetensorError) as error:
+                sample = {name: shard.get_slice(name)[row] for name in (*PICTURES, "tilt", *CONDITIONS)}
+        except (OSError, SafetensorError, IndexError) as error:
             raise InputError(f"cannot read {path}: {error}; check the dataset with --verify") from error
+        if any(sample[name].dtype != torch.uint8 for name in PICTURES) or sample["tilt"].ndim != 4:
+            raise InputError(f"cannot read {path}: its tensors are not those of a dataset; check it with --verify")
         sample |= {name: sample[name].to(torch.float32) / 255 for name in PICTURES}
         return sample | {"tilt": sample["tilt"].float()}

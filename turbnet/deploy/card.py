@@ -1,6 +1,7 @@
 """The model card: what a network states about itself, kept inside its ONNX file and beside it."""
 
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -9,7 +10,7 @@ from typing import Any, Self
 
 from turbnet._version import __version__
 from turbnet.deploy.seal import UNSEALED
-from turbnet.errors import InputError
+from turbnet.errors import InputError, check_range
 from turbnet.media.atomic import atomic_path
 
 PREFIX = "turbnet."
@@ -17,6 +18,7 @@ MAPS = "uncertainty maps"
 """Architecture on the card of a network that restores nothing but says where there is something to restore."""
 
 _LATER = ("carried",)  # fields that older files lack
+_CARRIED = 2**13  # greatest number of values carried for each pixel of a frame: 3 GB for a tile of 320 x 320
 
 
 class Card(ABC):
@@ -55,7 +57,7 @@ class Card(ABC):
             }
             sha256 = values.pop("sha256")
             return cls(**{name: json.loads(value) for name, value in values.items()} | {"sha256": sha256})
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise InputError(
                 f"the model card cannot be read by turbnet {__version__} ({error}); "
                 f"it was written by turbnet {metadata.get(PREFIX + 'version', 'of unknown version')}"
@@ -105,6 +107,9 @@ class ModelCard(Card):
         carried: further inputs and outputs of a network that goes frame by frame, by name: `shape` between batch and height,
             and `scale`, the fraction of the height and width it has; zero before the first frame. Empty: the network takes
             whole windows.
+
+    Raises:
+        InputError: a field of another kind, ParameterError: one out of range. A card may come from anywhere.
     """
 
     architecture: str
@@ -122,6 +127,18 @@ class ModelCard(Card):
     def __post_init__(self) -> None:
         low, high = self.data_range
         object.__setattr__(self, "data_range", (low, high))  # JSON knows lists only
+        _check(architecture=self.architecture, version=self.version, kind=str)
+        _check(config=self.config, notes=self.notes, carried=self.carried, kind=dict)
+        _check(low=low, high=high, kind=(int, float))
+        _check_whole("size_multiple", self.size_multiple, 1, 1024)
+        _check_whole("frames", self.frames, 1, 1000)
+        _check_whole("channels", self.channels, 1, 64)
+        for name, spec in self.carried.items():
+            _check(**{name: spec}, kind=dict)
+            _check_whole(f"scale of {name}", spec["scale"], 1, 64)
+            for size in spec["shape"]:
+                _check_whole(f"shape of {name}", size, 1, 2**16)
+            check_range(f"values a pixel of {name}", math.prod(spec["shape"]) / spec["scale"] ** 2, 0, _CARRIED)
 
     def carried_shapes(self, batch: int, height: int, width: int) -> dict[str, tuple[int, ...]]:
         """Shape of each part that is carried, for frames of this size."""
@@ -139,6 +156,17 @@ class ModelCard(Card):
             ("frames at a time", f"{self.frames} recommended, any number accepted"),
             *((f"carried {name}", _carried(**spec)) for name, spec in self.carried.items()),
         ]
+
+
+def _check(*, kind: type | tuple[type, ...], **values: Any) -> None:
+    for name, value in values.items():
+        if not isinstance(value, kind):
+            raise InputError(f"{name} = {value!r:.100} is of the wrong kind")
+
+
+def _check_whole(name: str, value: Any, low: int, high: int) -> None:
+    _check(**{name: value}, kind=int)
+    check_range(name, value, low, high)
 
 
 def _carried(shape: Sequence[int], scale: int) -> str:
@@ -166,6 +194,12 @@ class RecogniserCard(Card):
     notes: dict[str, Any] = field(default_factory=dict)
     version: str = __version__
     sha256: str = UNSEALED
+
+    def __post_init__(self) -> None:
+        _check(alphabet=self.alphabet, version=self.version, kind=str)
+        _check(config=self.config, notes=self.notes, kind=dict)
+        _check_whole("line_height", self.line_height, 1, 1024)
+        _check_whole("stride", self.stride, 1, 1024)
 
     def rows(self) -> list[tuple[str, Any]]:
         return [

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from turbnet.deploy.card import MAPS, ModelCard
@@ -25,15 +26,18 @@ def load_network(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     Raises:
         InputError: no file, no checkpoint, one of other software, or weights that do not fit the network it names.
     """
-    hyper_parameters = read_checkpoint(path)["hyper_parameters"]
+    hyper_parameters, state = read_checkpoint(path)["hyper_parameters"], load_net(path)
     try:
+        # Without memory first: a few bytes can name a network of any size.
+        with torch.device("meta"):
+            shapes = {name: value.shape for name, value in build(hyper_parameters["net"]).state_dict().items()}
+        wrong = [name for name in {**shapes, **state} if name not in state or state[name].shape != shapes.get(name)]
+        if wrong:
+            raise InputError(f"its weights do not fit the network it names ({', '.join(sorted(wrong)[:5])})")
         network = build(hyper_parameters["net"])
+        network.load_state_dict(state, strict=True)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    try:
-        network.load_state_dict(load_net(path), strict=True)
-    except RuntimeError as error:
-        raise InputError(f"{path}: its weights do not fit the network it names ({error})") from error
     if isinstance(network, Redegrading):
         return network.restorer.eval(), {**hyper_parameters, "net": hyper_parameters["net"]["restorer"]}
     return network.eval(), hyper_parameters

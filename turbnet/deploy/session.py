@@ -9,10 +9,14 @@ import onnxruntime
 from turbnet.deploy.card import ModelCard
 from turbnet.deploy.seal import verify
 from turbnet.errors import InputError, check_range
+from turbnet.media.guard import read_bytes, reading
 
 INPUT, OUTPUT = "frames", "restored"
 NEXT = "next_"
 """Before the name of what is carried on to the next frame, as an output."""
+
+LARGEST = 2**31
+"""Bytes of the largest model file: that of a protobuf message."""
 
 Carried = dict[str, np.ndarray]
 """What a network that goes frame by frame takes along, by name."""
@@ -32,19 +36,16 @@ class Model:
     def __init__(self, data: bytes, threads: int | None = None) -> None:
         self.digest = verify(data)
         self.threads = int(check_range("threads", available_cores() if threads is None else threads, 1, 1024))
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = self.threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # errors reach the user as InputError, not through onnxruntime's log
-        # Activations that fade into denormal numbers slow a processor down tenfold.
-        options.add_session_config_entry("session.set_denormal_as_zero", "1")
-        # Between two calls the cores belong to the decoder and the encoder, not to threads that spin.
-        options.add_session_config_entry("session.force_spinning_stop", "1")
-        try:
-            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's errors share no narrower base class
-            raise InputError(f"onnxruntime {onnxruntime.__version__} cannot run the model: {error}") from error
-        self.card = ModelCard.from_metadata(self._session.get_modelmeta().custom_metadata_map)
+        self._session = open_session(data, self.threads)
+        with reading("the model"):  # names that are not UTF-8
+            metadata = self._session.get_modelmeta().custom_metadata_map
+            found = self._session.get_inputs(), self._session.get_outputs()
+        self.card = ModelCard.from_metadata(metadata)
+        carried = self.card.carried
+        wanted = [INPUT, *carried], [OUTPUT, *(NEXT + name for name in carried)]
+        for names, values in zip(wanted, found, strict=True):
+            if {v.name: v.type for v in values} != dict.fromkeys(names, "tensor(float)"):
+                raise InputError(f"the model does not take and return what its card says: {', '.join(names)}, float32")
 
     @classmethod
     def load(cls, path: str | Path, threads: int | None = None) -> "Model":
@@ -53,10 +54,9 @@ class Model:
         Raises:
             InputError: names the file and what is wrong with it.
         """
+        data = read_bytes(path, LARGEST, "the model ")
         try:
-            return cls(Path(path).read_bytes(), threads)
-        except OSError as error:
-            raise InputError(f"cannot read the model {path}: {error.strerror or error}") from error
+            return cls(data, threads)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
@@ -100,6 +100,9 @@ class Model:
                 f"onnxruntime failed on frames of shape {frames_BTCHW.shape} ({error}); "
                 "take smaller tiles or a shorter window"
             ) from error
+        shape = frames_BTCHW.shape
+        if results[0].ndim != 5 or results[0].shape[:2] + results[0].shape[3:] != shape[:2] + shape[3:]:
+            raise InputError(f"the model made frames of shape {results[0].shape} of frames of shape {shape}")
         return results
 
     def _check(self, shape: tuple[int, ...]) -> None:
@@ -109,6 +112,26 @@ class Model:
                 f"frames of shape {shape}: the network takes (batch, frames, {card.channels}, height, width), "
                 f"height and width multiples of {card.size_multiple}"
             )
+
+
+def open_session(data: bytes, threads: int) -> onnxruntime.InferenceSession:
+    """A session on the processor for the bytes of a sealed file.
+
+    Raises:
+        InputError: they are beyond the installed onnxruntime.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 4  # errors reach the user as InputError, not through onnxruntime's log
+    # Activations that fade into denormal numbers slow a processor down tenfold.
+    options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    # Between two calls the cores belong to the decoder and the encoder, not to threads that spin.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # and not whatever the first bytes say
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's errors share no narrower base class
+        raise InputError(f"onnxruntime {onnxruntime.__version__} cannot run the model: {error}") from error
 
 
 def available_cores() -> int:

@@ -4,6 +4,7 @@ from importlib import resources
 from pathlib import Path
 
 from turbnet.errors import InputError
+from turbnet.media.guard import reading
 
 DEFAULT = "s"
 """The released network that restores unless another is asked for."""
@@ -41,7 +42,8 @@ def find_model(name_or_path: str | Path) -> Path:
     if str(name_or_path) in models:
         return models[str(name_or_path)]
     path = Path(name_or_path)
-    if path.is_file():
-        return path
+    with reading(path):  # a name may be too long
+        if path.is_file():
+            return path
     names = ", ".join(models) or "none in this installation"
     raise InputError(f"there is no model {name_or_path}: neither a file nor a released model ({names})")

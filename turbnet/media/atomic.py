@@ -59,6 +59,10 @@ def check_output(path: str | Path) -> Path:
         raise InputError(f"cannot write {path}: the folder {parent} does not exist; create it first")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(f"cannot write {path}: no permission to write in {parent}")
+    try:
+        target.exists()
+    except OSError as error:  # a name too long
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
     if target.is_dir() and any(target.iterdir()):
         raise InputError(f"cannot write {path}: the folder exists and is not empty; remove it or choose another name")
     if target.exists() and not target.is_dir() and not target.is_file():

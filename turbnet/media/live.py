@@ -15,6 +15,11 @@ STANDARD = Path("-")
 """Standard input where something is read, standard output where something is written."""
 
 _CAMERA = "v4l2"
+# Containers of one stream of bytes, and no protocol at all: a playlist that comes through a pipe opens nothing.
+_ALONE = {
+    "format_whitelist": "mov,avi,matroska,mpeg,mpegvideo,mpegts,asf,flv,ogg,nut,yuv4mpegpipe,mjpeg,png_pipe,jpeg_pipe",
+    "protocol_whitelist": "pipe",
+}
 _PATIENCE = 0.1  # seconds between two looks at whether the end was asked for
 
 
@@ -33,7 +38,8 @@ def open_live(path: Path, ended: Callable[[], bool]) -> Any:
         raise InputError("standard input is a terminal; pipe a clip into it")
     if path.is_char_device():
         return av.open(str(path.absolute()), format=_CAMERA)
-    return av.open(_Pipe(sys.stdin.fileno() if path == STANDARD else os.open(path, os.O_RDONLY), ended))
+    descriptor = sys.stdin.fileno() if path == STANDARD else os.open(path, os.O_RDONLY)
+    return av.open(_Pipe(descriptor, ended), options=_ALONE)
 
 
 class _Pipe:

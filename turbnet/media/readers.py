@@ -14,12 +14,16 @@ Broken files raise InputError, at the latest when the pass comes to the broken p
 
 Damage that decodes to a valid picture, as within uncompressed pixels or VP8, cannot be told from the picture.
 
-Decoders meet damaged files with whatever exception the damage leads to, hence the broad net in `_reading`.
+A file is what its bytes say and stands for itself alone: playlists and scripts, which FFmpeg would follow to other files and
+addresses, are refused, and so is what declares more pixels than `turbnet.media.guard.LARGEST`.
 """
 
 import logging
+import lzma
 import os
 import re
+import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -34,6 +38,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from turbnet.errors import InputError
+from turbnet.media.guard import LARGEST, check_size, reading
 from turbnet.media.live import STANDARD, is_live, open_live
 from turbnet.media.sound import Sound, start_of
 
@@ -50,6 +55,12 @@ _LARGEST_FLOAT = 2.0
 _ACCURATE = (
     Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
 )
+# Containers of one file each, and no protocol but files: a playlist named clip.mp4 reads nothing else.
+_ALONE = {
+    "format_whitelist": "mov,avi,matroska,mpeg,mpegvideo,mpegts,asf,flv,ogg,png_pipe",
+    "protocol_whitelist": "file",
+}
+_PILLOW = ("PNG", "JPEG", "BMP", "GIF", "WEBP")
 _GREY_MODES = {"1", "L", "LA", "La", "F", "I", "I;16", "I;16L", "I;16B", "I;16N"}
 
 
@@ -89,16 +100,17 @@ def open_source(path: Path, threads: int | None = None, ended: Callable[[], bool
         threads: a video decoder's; None: all cores.
         ended: whether a pipe or a camera is to end, asked again and again.
     """
-    if is_live(path):
-        return _live(path, threads, ended)
-    if path.is_dir():
-        return _folder(path)
-    if not path.exists() and any(sign in path.name for sign in "*?["):
-        return _sequence([picture for picture in path.parent.glob(path.name) if picture.is_file()], path)
-    if not path.exists():
-        raise InputError(f"there is no file or folder {path}")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty (0 bytes)")
+    with reading(path):  # a name may be too long, a pattern may be none
+        if is_live(path):
+            return _live(path, threads, ended)
+        if path.is_dir():
+            return _folder(path)
+        if not path.exists():
+            if any(sign in path.name for sign in "*?["):
+                return _sequence([picture for picture in path.parent.glob(path.name) if picture.is_file()], path)
+            raise InputError(f"there is no file or folder {path}")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path} is empty (0 bytes)")
     kind = _image_kind(path)
     if kind == "tiff":
         return _tiff(path)
@@ -114,19 +126,8 @@ def open_source(path: Path, threads: int | None = None, ended: Callable[[], bool
     )
 
 
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise InputError(f"cannot read {path}: {' '.join(reason.split())}") from error
-
-
 def _image_kind(path: Path) -> str | None:
-    with _reading(path):
+    with reading(path):
         start = _bytes_at(path, 0, 16)
     if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return "tiff"
@@ -161,7 +162,7 @@ def _rgb(pixels: NDArray[Any], path: Path) -> Frame:
 
 
 def _pillow(path: Path) -> Source:
-    with _reading(path), Image.open(path) as image:
+    with reading(path), _open_image(path, _PILLOW) as image:
         turned = image.getexif().get(ExifTags.Base.Orientation, 1) > 4
         height, width = image.size if turned else image.size[::-1]
         moving = image.format in ("GIF", "WEBP", "PNG")
@@ -177,13 +178,21 @@ def _pillow(path: Path) -> Source:
 
     def frames() -> Iterator[TimedFrame]:
         milliseconds = 0
-        with _reading(path), Image.open(path) as image:
+        with reading(path), _open_image(path, _PILLOW) as image:
             for index in range(count):
                 image.seek(index)
                 yield Fraction(milliseconds, 1000), _rgb(_pillow_pixels(ImageOps.exif_transpose(image)), path)
                 milliseconds += round(image.info.get("duration") or 100)
 
     return Source(info, frames)
+
+
+def _open_image(path: Path, formats: tuple[str, ...]) -> Image.Image:
+    # Pillow warns of two thirds of our largest picture: lines beside ours, or none of the caller's.
+    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+    image = Image.open(path, formats=formats)
+    check_size(path, image.height, image.width)
+    return image
 
 
 def _pillow_pixels(image: Image.Image) -> NDArray[Any]:
@@ -208,7 +217,7 @@ def _bytes_at(path: Path, offset: int, count: int) -> bytes:
 
 def _deep_png(path: Path) -> Iterator[TimedFrame]:
     """A PNG of 16 bits a channel, which Pillow would cut to 8."""
-    with _reading(path), av.open(_ffmpeg_name(path)) as container:
+    with reading(path), _open_video(path) as container:
         frame = next(container.decode(video=0))
         # PyAV hands out every 16-bit format but grey with alpha as it is.
         pixels = frame.to_ndarray(format="rgba64le" if frame.format.name.startswith("ya") else None)
@@ -223,8 +232,8 @@ def _tiff(path: Path) -> Source:
 
     # Its warnings about a damaged file would stand beside our one line.
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
-    with _reading(path), tifffile.TiffFile(path) as tiff:
-        pages = [page for page in tiff.pages if not _is_thumbnail(page)]
+    with reading(path), tifffile.TiffFile(path) as tiff:
+        pages = [page for _, page in _pages(path, tiff)]
         if not pages:
             raise InputError(f"{path} holds no picture")
         if tiff.series[0].is_truncated or tiff.series[0].keyframe.imagedepth > 1:
@@ -234,22 +243,29 @@ def _tiff(path: Path) -> Source:
         info = ClipInfo(len(pages), height, width, DEFAULT_FPS, first.samplesperpixel <= 2 and first.photometric < 2)
 
     def frames() -> Iterator[TimedFrame]:
-        with _reading(path), tifffile.TiffFile(path) as tiff:
-            for index, page in enumerate(tiff.pages):
-                if not _is_thumbnail(page):
-                    yield None, _rgb(_tiff_pixels(path, page, index), path)
+        with reading(path), tifffile.TiffFile(path) as tiff:
+            for index, page in _pages(path, tiff):
+                yield None, _rgb(_tiff_pixels(path, page, index), path)
 
     return Source(info, frames)
 
 
-def _is_thumbnail(page: Any) -> bool:
-    return bool(page.keyframe.is_reduced)
+def _pages(path: Path, tiff: Any) -> Iterator[tuple[int, Any]]:
+    """Pages that are no thumbnails, by their number. Each says where the next one is, which may be an earlier one."""
+    seen: set[int] = set()
+    for index, page in enumerate(tiff.pages):
+        if page.offset in seen:
+            raise InputError(f"cannot read {path}: its pages run in a circle")
+        seen.add(page.offset)
+        if not page.keyframe.is_reduced:
+            yield index, page
 
 
 def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
     import tifffile
 
     page = page.aspage()
+    check_size(path, page.imagelength, page.imagewidth)
     if page.photometric in (tifffile.PHOTOMETRIC.PALETTE, tifffile.PHOTOMETRIC.YCBCR) or page.compression not in (
         tifffile.COMPRESSION.NONE,
         tifffile.COMPRESSION.ADOBE_DEFLATE,
@@ -259,15 +275,35 @@ def _tiff_pixels(path: Path, page: Any, index: int) -> NDArray[Any]:
         # LZW, JPEG and the like: libtiff through Pillow, which keeps 16 bits in grey only.
         if page.bitspersample > 8 and page.samplesperpixel > 1:
             raise InputError(f"cannot read {path}: save a compressed TIFF of over 8 bits a channel uncompressed")
-        with Image.open(path) as image:
+        with _open_image(path, ("TIFF",)) as image:
             image.seek(index)
             return _pillow_pixels(image)
+    _check_inflated(path, page)
     pixels = page.asarray()
     if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and pixels.ndim == 3:
         pixels = np.moveaxis(pixels, 0, -1)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
         pixels = ~pixels if pixels.dtype.kind in "ub" else 1 - pixels
     return pixels
+
+
+def _check_inflated(path: Path, page: Any) -> None:
+    """Raise InputError if a page has too many channels, or a strip inflates to more than a picture: tifffile lets it."""
+    import tifffile
+
+    if page.samplesperpixel > 4 or page.bitspersample > 64:
+        raise InputError(f"cannot read {path}: {page.samplesperpixel} channels are neither grey nor RGB")
+    height, width = (page.tilelength, page.tilewidth) if page.is_tiled else (page.imagelength, page.imagewidth)
+    check_size(path, height, width)
+    if page.compression == tifffile.COMPRESSION.NONE:
+        return
+    most = 1 + height * width * page.samplesperpixel * page.bitspersample // 8
+    with path.open("rb") as file:
+        for start, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(start)
+            unpack = lzma.LZMADecompressor() if page.compression == tifffile.COMPRESSION.LZMA else zlib.decompressobj()
+            if len(unpack.decompress(file.read(count), most)) == most:
+                raise InputError(f"cannot read {path}: it inflates to more than its pixels")
 
 
 # --- folders -----------------------------------------------------------------------------------------------------
@@ -278,7 +314,7 @@ def _natural(path: Path) -> list[str | int]:
 
 
 def _folder(path: Path) -> Source:
-    with _reading(path):
+    with reading(path):
         entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     if not entries:
         raise InputError(f"the folder {path} is empty")
@@ -323,7 +359,7 @@ def _still(path: Path) -> Source:
 
 
 def _video(path: Path, threads: int | None) -> Source:
-    with _reading(path), av.open(_ffmpeg_name(path)) as container:
+    with reading(path), _open_video(path) as container:
         stream = _video_stream(container, path, threads)
         frame = next(container.decode(stream), None)
         if frame is None:
@@ -334,7 +370,7 @@ def _video(path: Path, threads: int | None) -> Source:
         info = ClipInfo(stream.frames or None, height, width, fps, _is_grey_video(stream), stream.time_base)
 
     def frames() -> Iterator[TimedFrame]:
-        with _reading(path), av.open(_ffmpeg_name(path)) as container:
+        with reading(path), _open_video(path) as container:
             yield from _decode(container, path, threads)
 
     return Source(info, frames, lambda: _sound(path))
@@ -342,14 +378,14 @@ def _video(path: Path, threads: int | None) -> Source:
 
 @contextmanager
 def _sound(path: Path) -> Iterator[Sound | None]:
-    with _reading(path):
-        container = av.open(_ffmpeg_name(path))
+    with reading(path):
+        container = _open_video(path)
     with container:
         yield Sound(container, _sound_packets(container, path)) if container.streams.audio else None
 
 
 def _sound_packets(container: Any, path: Path) -> Iterator[Any]:
-    with _reading(path):
+    with reading(path):
         for packet in container.demux(container.streams.audio):
             if packet.dts is not None:  # but for the empty one at the end
                 yield packet
@@ -357,7 +393,7 @@ def _sound_packets(container: Any, path: Path) -> Iterator[Any]:
 
 def _live(path: Path, threads: int | None, ended: Callable[[], bool]) -> Source:
     name = Path("standard input") if path == STANDARD else path
-    with _reading(name):
+    with reading(name):
         container = open_live(path, ended)
         stream = _video_stream(container, name, threads)
         sound = Sound(container) if container.streams.audio else None
@@ -388,7 +424,7 @@ def _decode_live(
     container: Any, sound: Sound | None, path: Path, threads: int | None, ended: Callable[[], bool]
 ) -> Iterator[TimedFrame]:
     stream, start = _video_stream(container, path, threads), start_of(container)
-    with _reading(path), container:
+    with reading(path), container:
         for packet in container.demux([stream, *container.streams.audio]):
             if ended():
                 return
@@ -405,15 +441,17 @@ def _is_grey_video(stream: Any) -> bool:
     return (stream.codec_context.pix_fmt or "").startswith("gray")
 
 
-def _ffmpeg_name(path: Path) -> str:
-    """Absolute, so that FFmpeg never takes what precedes a colon for a protocol."""
-    return str(path.absolute())
+def _open_video(path: Path) -> Any:
+    # An absolute name, so that FFmpeg never takes what precedes a colon for a protocol.
+    return av.open(str(path.absolute()), options=_ALONE)
 
 
 def _video_stream(container: Any, path: Path, threads: int | None) -> Any:
     if not container.streams.video:
         raise InputError(f"{path} holds no video")
     stream = container.streams.video[0]
+    check_size(path, stream.height, stream.width)
+    stream.codec_context.options = {"max_pixels": str(LARGEST)}  # pictures may be larger than the container says
     stream.thread_type = "AUTO"
     stream.codec_context.thread_count = threads or 0  # FFmpeg's 0 is all cores
     return stream

@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 from PIL import Image
 
 from turbnet.data.boxes import TextBox
 from turbnet.deploy.card import RecogniserCard
 from turbnet.deploy.seal import verify
+from turbnet.deploy.session import LARGEST, open_session
 from turbnet.deploy.weights import released_recogniser
 from turbnet.errors import InputError
+from turbnet.media.guard import read_bytes
 from turbnet.metrics.text import Picture, crop_boxes
 
 _GREY = np.array([0.299, 0.587, 0.114])
@@ -37,11 +38,7 @@ class Recogniser:
 
     def __init__(self, data: bytes, threads: int = 1) -> None:
         verify(data)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.log_severity_level = 4
-        options.add_session_config_entry("session.set_denormal_as_zero", "1")
-        self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        self._session = open_session(data, threads)
         self.card = RecogniserCard.from_metadata(self._session.get_modelmeta().custom_metadata_map)
 
     @classmethod
@@ -52,10 +49,9 @@ class Recogniser:
             InputError: names the file and what is wrong with it.
         """
         path = released_recogniser() if path is None else path
+        data = read_bytes(path, LARGEST, "the recogniser ")
         try:
-            return cls(Path(path).read_bytes())
-        except OSError as error:
-            raise InputError(f"cannot read the recogniser {path}: {error.strerror or error}") from error
+            return cls(data)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from turbnet._version import __version__
 from turbnet.errors import InputError, ParameterError, check_range
 from turbnet.media.atomic import atomic_path
+from turbnet.media.guard import read_json
 from turbnet.optics.superposition import scatter
 from turbnet.progress import progress_bar
 from turbnet.simulate.parallel import on_all_cores
@@ -116,10 +117,17 @@ def run_points(
             task = progress.add_task("split-step", total=len(files), completed=len(files) - len(missing))
             for _ in pieces:
                 progress.advance(task)
-    try:
-        states = [load_file(file) for file in files]
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"cannot read the run in {folder}: {error}; delete the damaged file and run again") from error
+    states = []
+    for start, file in zip(starts, files, strict=True):
+        count = min(start + chunk, len(split_step.points)) - start
+        shapes = {"psf": (count, size, size), "tilt_free_psf": (count, size, size), "coefficients": (count, MODES)}
+        try:
+            state = load_file(file)
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"cannot read {file}: {error}; delete the damaged file and run again") from error
+        if {name: tuple(value.shape) for name, value in state.items()} != shapes:
+            raise InputError(f"cannot read {file}: it holds other points; delete it and run again")
+        states.append(state)
     return PointField(**{name: torch.cat([state[name] for state in states]) for name in states[0]})
 
 
@@ -137,11 +145,11 @@ def _claim(folder: Path, split_step: SplitStep, request: dict[str, float]) -> No
         "dtype": str(split_step.dtype),
         **request,
     }
+    file = folder / "run.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = folder / "run.json"
-        found = json.loads(file.read_text()) if file.exists() else None
-    except (OSError, ValueError) as error:
+        found = read_json(file) if file.exists() else None
+    except (OSError, InputError) as error:
         raise InputError(f"cannot use {folder} for a split-step run: {error}") from error
     if found is None:
         with atomic_path(file) as temporary:

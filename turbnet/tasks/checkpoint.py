@@ -1,5 +1,6 @@
 """Networks out of checkpoints, without executing code."""
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from turbnet.errors import InputError
+from turbnet.media.guard import reading
 from turbnet.weights.released import read_card, read_weights, released_networks
 
 
@@ -18,20 +20,36 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         InputError: there is no such file, it is no checkpoint, or it is none of ours.
     """
     path = Path(path)
-    if not path.is_file():
+    with reading(path):  # a name may be too long
+        found = path.is_file()
+    if not found:
         if str(path) in released_networks():
             return _released(str(path))
         names = ", ".join(released_networks()) or "none in this installation"
         raise InputError(f"there is no checkpoint {path}, nor a released network of this name ({names})")
     try:
+        _check_stored(path)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # of bytes that are no pickle, the unpickler raises whatever they lead it to
         why = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"{path} is not a checkpoint that can be loaded safely: {why}") from error
     hyper = checkpoint.get("hyper_parameters") if isinstance(checkpoint, dict) else None
-    if not isinstance(hyper, dict) or not isinstance(hyper.get("net"), dict) or "state_dict" not in checkpoint:
+    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    if not isinstance(hyper, dict) or not isinstance(hyper.get("net"), dict) or not isinstance(state, dict):
         raise InputError(f"{path} is not a checkpoint of turbnet: it does not say which network it holds")
+    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()):
+        raise InputError(f"{path} is not a checkpoint of turbnet: its state is not tensors by name")
     return checkpoint
+
+
+def _check_stored(path: Path) -> None:
+    """Raise InputError if a checkpoint is not a zip archive of parts as they are: what is packed may grow a thousandfold."""
+    with zipfile.ZipFile(path) as archive:
+        parts = archive.infolist()
+    if any(part.compress_type != zipfile.ZIP_STORED for part in parts):
+        raise InputError("its parts are compressed")
+    if sum(part.file_size for part in parts) > path.stat().st_size:
+        raise InputError("its parts claim more bytes than the file has")
 
 
 def _released(name: str) -> dict[str, Any]:
@@ -56,6 +74,6 @@ def load_net(path: str | Path, expect: Mapping[str, Any] | None = None) -> dict[
     checkpoint = read_checkpoint(path)
     found = checkpoint["hyper_parameters"]["net"]
     if expect is not None and dict(expect) != found:
-        raise InputError(f"{path} holds another network: {found}, not {dict(expect)}")
+        raise InputError(f"{path} holds another network: {found!r:.500}, not {dict(expect)}")
     prefix = "net."
     return {key[len(prefix) :]: value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)}

@@ -3,7 +3,6 @@
 import logging
 import warnings
 from pathlib import Path
-from pydoc import locate
 from typing import Any
 
 import lightning as L
@@ -12,35 +11,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from turbnet.errors import InputError
+from turbnet.media.guard import reading
 from turbnet.tasks.checkpoint import read_checkpoint
 from turbnet.tasks.interruption import Interruption
 from turbnet.tasks.simulated import SimulatedTask
-
-ALLOWED = ("turbnet.", "lightning.pytorch.")
-"""Prefixes of what a configuration may instantiate: a config file is data and must not become a way to run any code."""
-
-
-def check_targets(config: Any, where: str = "config") -> None:
-    """Raise InputError if any `_target_` in the configuration is not a class that is defined inside `ALLOWED`."""
-    if isinstance(config, dict):
-        target = config.get("_target_")
-        if target is not None and not _is_allowed(str(target)):
-            raise InputError(
-                f"{where}._target_ = {target!r}: a configuration may only name classes of {' or '.join(ALLOWED)}*"
-            )
-        for key, value in config.items():
-            check_targets(value, f"{where}.{key}")
-    elif isinstance(config, list):
-        for index, value in enumerate(config):
-            check_targets(value, f"{where}[{index}]")
-
-
-def _is_allowed(target: str) -> bool:
-    if not target.startswith(ALLOWED):
-        return False
-    found = locate(target)
-    # A name such as turbnet.x.os.system can be reached, and is not ours.
-    return isinstance(found, type) and found.__module__.startswith(ALLOWED)
+from turbnet.tasks.targets import check_targets
 
 
 def check_resume(path: str, task: SimulatedTask) -> None:
@@ -48,10 +23,24 @@ def check_resume(path: str, task: SimulatedTask) -> None:
     checkpoint = read_checkpoint(path)
     found, wanted = checkpoint["hyper_parameters"]["net"], task.hparams["net"]
     if found != wanted:
-        raise InputError(f"cannot resume from {path}: it holds another network: {found}, not {wanted}")
-    learned = [len(group["params"]) for state in checkpoint["optimizer_states"] for group in state["param_groups"]]
+        raise InputError(f"cannot resume from {path}: it holds another network: {found!r:.500}, not {wanted}")
+    with reading(path):
+        learned = [len(group["params"]) for state in checkpoint["optimizer_states"] for group in state["param_groups"]]
+        _check_own_files(path, checkpoint.get("callbacks", {}))
     if learned != [len(list(task.trained()))]:
         raise InputError(f"cannot resume from {path}: it was training other parts of the network; see task.start_from")
+
+
+def _check_own_files(path: str, callbacks: dict[str, Any]) -> None:
+    """Raise InputError if a callback remembers files outside its own folder: lightning deletes what it no longer keeps."""
+    for state in callbacks.values():
+        if not isinstance(state, dict) or not state.get("dirpath"):
+            continue
+        folder = Path(state["dirpath"]).resolve()
+        names = [state.get(name) for name in ("best_model_path", "kth_best_model_path", "last_model_path")]
+        for name in filter(None, [*names, *state.get("best_k_models", {})]):
+            if not Path(name).resolve().is_relative_to(folder):
+                raise InputError(f"cannot resume from {path}: it names {name}, which does not lie in {folder}")
 
 
 def _check_whole(config: dict[str, Any], name: str, low: int, high: int) -> None:
