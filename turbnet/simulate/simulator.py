@@ -35,7 +35,6 @@ from turbnet.simulate.psf_basis import kernel_size, psf_basis
 from turbnet.simulate.sensor import Sensor, exposed
 from turbnet.simulate.tilt import check_precision, upsample
 
-
 STRONGEST = 100.0
 """Greatest D/r0: at 1000 light comes from a thousand pixels away, and a kernel of 31 pixels shows nothing of its blur."""
 
