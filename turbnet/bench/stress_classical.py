@@ -12,7 +12,7 @@ from turbnet.classical.methods import METHODS
 from turbnet.deploy.method import ClassicalMethod
 from turbnet.deploy.restore import restore_array
 
-_FLAT = 1e-3  # of full scale: deconvolutions run some iterations in float32 and stop
+_FLAT = 1e-5  # of full scale: rounding of a few iterations in float32
 
 
 def cells(quick: bool) -> Iterator[Cell]:

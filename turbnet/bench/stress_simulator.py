@@ -17,7 +17,7 @@ from turbnet.simulate.simulator import Simulator
 
 _UNIFORM = 1e-4  # of the level: the same air is taken out of a uniform scene that was put in
 _SLOW = 10.0  # D/r0 beyond which light comes from so far that a small picture takes seconds
-_NEGATIVE = 0.15  # of the brightest: few components leave ripples of both signs around a point
+_NEGATIVE = 0.05  # of the brightest: few components leave ripples of both signs around a point
 
 
 def cells(quick: bool) -> Iterator[Cell]:
@@ -86,7 +86,7 @@ def _double(strength: float) -> Iterator[Check]:
     scene, draw = clip("texture", 31, 18), double.draw([0])
     single = type(draw)(draw.coefficients.float(), draw.stride, draw.margin, draw.q)
     exact, found = double(scene, draw).frames, _simulator(strength, 31, 18)(scene.float(), single).frames
-    yield close("difference from float64", found, exact, 1e-3)
+    yield close("difference from float64", found, exact, 1e-4)
 
 
 def _air(cn2: float) -> Iterator[Check]:
