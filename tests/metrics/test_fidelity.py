@@ -121,3 +121,10 @@ def test_frame_smaller_than_the_window():
     assert ssim(np.ones((11, 11, 1)), np.ones((11, 11, 1))) == pytest.approx(1.0)
     with pytest.raises(InputError, match="at least 11x11 must remain"):
         ssim(np.ones((11, 10, 1)), np.ones((11, 10, 1)))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_frames_are_compared_in_float32(clips, dtype):
+    restored, reference = (torch.from_numpy(clip).to(dtype) for clip in clips)
+    for score in (psnr, ssim):
+        torch.testing.assert_close(score(restored, reference), score(restored.float(), reference.float()))

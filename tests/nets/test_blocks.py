@@ -68,3 +68,11 @@ def test_each_frame_sees_frames_alone():
     out = each_frame(layer, clip)
     assert out.shape == (2, 3, 6, 3, 3)
     torch.testing.assert_close(out[1, 2], layer(clip[1, 2:3])[0])
+
+
+def test_a_flow_that_is_not_a_number_harms_no_memory():
+    """Torch's own gradient of bilinear sampling at NaN ends the process."""
+    image, flow = torch.rand(1, 3, 48, 32, requires_grad=True), torch.zeros(1, 2, 48, 32)
+    flow[0, :, 5] = float("nan")
+    (slope,) = torch.autograd.grad(warp(image, flow).sum(), image)
+    torch.testing.assert_close(slope, torch.ones_like(slope))

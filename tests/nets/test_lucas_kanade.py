@@ -81,3 +81,13 @@ def test_gradient_is_that_of_finite_differences():
     assert torch.autograd.gradcheck(
         lambda a, p: lucas_kanade(a, waves()[..., :6, :6], p), (image, prior), eps=1e-2, atol=3e-2, rtol=3e-2
     )
+
+
+@pytest.mark.parametrize("brightness", [1.0, 1e3, 1e6])
+def test_edges_of_any_brightness_give_a_finite_step(brightness):
+    """All gradients run one way: the determinant is zero but for the prior, and rounding takes the prior away."""
+    slope = torch.arange(16.0) + torch.arange(12.0)[:, None]
+    image = (brightness * (slope > 11).float()).expand(1, 3, -1, -1)
+    step = lucas_kanade(image, image.roll(1, -1), PRIOR)
+    assert torch.isfinite(step).all()
+    assert float(step.abs().max()) <= LARGEST_STEP

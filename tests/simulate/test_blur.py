@@ -7,7 +7,7 @@ from scipy.special import j1
 
 import turbnet.simulate.blur as blur_module
 from turbnet.atmosphere.path import OpticalPath
-from turbnet.errors import ParameterError
+from turbnet.errors import InputError, ParameterError
 from turbnet.simulate.blur import blur, blur_weights
 from turbnet.simulate.field import ZernikeField
 from turbnet.simulate.psf_basis import PSFBasis, kernel_size, psf_basis, tilt_free_psf
@@ -231,3 +231,9 @@ def test_gradients_at_both_resolutions(factor):
     scene = torch.rand(2, 1, 9, 7, generator=generator(0), dtype=torch.float64, requires_grad=True)
     weights = torch.randn(2, 3, 4, 3, generator=generator(1), dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda s, w: blur(s, w, basis, 4, factor), (scene, weights), fast_mode=True)
+
+
+def test_coarse_numbers_are_refused():
+    basis = psf_basis(1, 3.0, 3.0)
+    with pytest.raises(InputError, match="float32"):
+        blur(torch.ones(1, 1, 9, 9, dtype=torch.uint8), torch.zeros(1, 1, 3, 3), basis, 4)

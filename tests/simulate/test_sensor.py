@@ -144,3 +144,8 @@ class TestCompression:
 def test_out_of_range(bad):
     with pytest.raises(ParameterError, match=next(iter(bad))):
         Sensor(**bad)
+
+
+def test_any_brightness_saturates():
+    seen = Sensor(bits=8)(torch.tensor([1e8, float("inf"), -1e8, 0.5]))
+    torch.testing.assert_close(seen, torch.tensor([1.0, 1.0, 0.0, 128 / 255]))

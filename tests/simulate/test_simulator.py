@@ -283,3 +283,15 @@ def test_one_thread_or_two_give_the_same_clip(scene):
         torch.set_num_threads(1)
     assert torch.equal(drawn[0].coefficients, drawn[1].coefficients)
     assert torch.equal(*frames)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.uint8])
+def test_a_scene_of_coarse_numbers_is_refused(simulator, scene, dtype):
+    with pytest.raises(InputError, match="float32"):
+        simulator((scene * 255).to(dtype), simulator.draw([0]))
+
+
+def test_air_in_which_light_comes_from_everywhere_is_refused():
+    """D/r0 = 4000 would take a margin of thousands of pixels, and all the memory there is."""
+    with pytest.raises(ParameterError, match="D/r0"):
+        Simulator(OpticalPath(0.2034, 7000.0, Constant(1e-10)), 8, 8)

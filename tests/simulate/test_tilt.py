@@ -4,7 +4,7 @@ import skimage.data
 import torch
 
 from turbnet.errors import InputError
-from turbnet.simulate.tilt import carry, displacement, sample, tilt, upsample
+from turbnet.simulate.tilt import carry, displacement, sample, splat, tilt, upsample
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +102,15 @@ def test_a_tilt_that_is_not_a_number_is_refused(picture):
     t[0, 0, 5, 5] = float("nan")
     with pytest.raises(InputError, match="tilt"):
         tilt(picture, t, 4)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 17), (17, 1), (5, 4)])
+def test_light_leaves_a_picture_of_one_pixel_as_it_leaves_others(size):
+    away = torch.full((1, 2, *size), 40.0)
+    assert float(splat(torch.ones(1, 1, *size), away).abs().sum()) == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.uint8])
+def test_numbers_too_coarse_for_places_are_refused(dtype):
+    with pytest.raises(InputError, match="float32"):
+        splat(torch.ones(1, 1, 9, 9).to(dtype), torch.ones(1, 2, 9, 9).to(dtype))

@@ -14,6 +14,7 @@ VERBS = {
     "restore": "a turbulent clip to a clear one",
     "evaluate": "score a restored clip against its reference",
     "bench": "run time against error",
+    "stress": "try to break every part numerically",
 }
 
 

@@ -68,8 +68,8 @@ def ssim(restored: Frames, reference: Frames, border: int = 0) -> Frames: ...
 def ssim(restored: Any, reference: Any, border: int = 0) -> Any:
     """Structural similarity of each frame, at most 1. Arguments and errors as `psnr`; frames need 11 x 11 pixels.
 
-    Computed in the precision of the frames: float32 is eight times as fast and right to about 1e-6 where there is
-    texture, 1e-4 in bright and nearly flat pictures, whose variance it takes from the difference of large numbers.
+    Computed in the precision of the frames, float32 at least: it is eight times as fast and right to about 1e-6 where there
+    is texture, 1e-4 in bright and nearly flat pictures, whose variance it takes from the difference of large numbers.
     """
     first_NCHW, second_NCHW, finish = _prepare(restored, reference, border, smallest=_WINDOW)
     return finish(torch.stack([_ssim(*pair) for pair in zip(first_NCHW, second_NCHW, strict=True)]))
@@ -124,7 +124,8 @@ def _prepare(restored: Any, reference: Any, border: int, smallest: int) -> tuple
     if not (torch.isfinite(first).all() and torch.isfinite(second).all()):
         raise InputError("cannot compare frames that hold NaN or infinite pixels")
 
-    precision = torch.promote_types(first.dtype, second.dtype)
+    # Variances are differences of large numbers: half precision holds none.
+    precision = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
 
     def arranged(frames: Tensor) -> Tensor:
         inner = frames[..., border : height - border, border : width - border, :].to(precision)

@@ -59,6 +59,8 @@ def warp(image_NCHW: Tensor, flow_N2HW: Tensor) -> Tensor:
     x = torch.arange(width, device=flow_N2HW.device, dtype=torch.float32)
     y = torch.arange(height, device=flow_N2HW.device, dtype=torch.float32)[:, None]
     flow = flow_N2HW.float()
+    # Torch's backward pass writes outside its memory where a place is NaN; forward it takes it for the border.
+    flow = flow.masked_fill(flow.isnan(), 0.0)
     grid = torch.stack(
         ((x + flow[:, 0] + 0.5) * (2 / width) - 1, (y + flow[:, 1] + 0.5) * (2 / height) - 1),
         dim=-1,

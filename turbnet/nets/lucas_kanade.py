@@ -37,6 +37,7 @@ def lucas_kanade(image_NCHW: Tensor, reference_NCHW: Tensor, prior: Tensor) -> T
         products = F.avg_pool2d(F.pad(products, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
     xx, yy, xy, x_error, y_error = products.split(1, dim=1)
     xx, yy = xx + prior, yy + prior
-    determinant = xx * yy - xy * xy  # at least prior^2, by Cauchy-Schwarz
+    # At least prior^2 by Cauchy-Schwarz, but not for rounding where the picture is far brighter than 1.
+    determinant = torch.maximum(xx * yy - xy * xy, prior * prior)
     step = torch.cat((yy * x_error - xy * y_error, xx * y_error - xy * x_error), dim=1) / -determinant
     return step.clamp(-LARGEST_STEP, LARGEST_STEP)

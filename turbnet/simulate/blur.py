@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 
 from turbnet.simulate.phase_to_space import PhaseToSpace
 from turbnet.simulate.psf_basis import PSFBasis, low_band, roll_off
-from turbnet.simulate.tilt import upsample
+from turbnet.simulate.tilt import check_precision, upsample
 
 _TILE = 768
 """Pixels a side up to which a picture is blurred in one piece; larger ones go in pieces that stay in the cache."""
@@ -56,7 +56,11 @@ def blur(image_BCHW: Tensor, weights_BMhw: Tensor, basis: PSFBasis, stride: int,
         basis: the PSF basis they belong to.
         stride: step of the coarse grid, pixels; even if factor is 2.
         factor: 2 to sum the components at half the resolution.
+
+    Raises:
+        InputError: the picture is neither float32 nor float64.
     """
+    check_precision(image_BCHW)
     *_, height, width = image_BCHW.shape
     if max(height, width) <= _TILE:
         return _piece(image_BCHW, weights_BMhw, basis, stride, factor, (0, height), (0, width))

@@ -77,8 +77,8 @@ class Sensor:
             out = (out + noise * variance.clamp(min=1e-12).sqrt()).clamp(0, 1)
         if self.bits:
             steps = 2**self.bits - 1
-            rounded = (out.clamp(0, 1) * steps).round() / steps
-            out = out + (rounded - out).detach()
+            out = out.clamp(0, 1)  # before the difference, which is no number of an infinite pixel
+            out = out + ((out * steps).round() / steps - out).detach()
         if self.gamma or self.jpeg is not None:
             out = to_srgb(out)
         if self.jpeg is not None:

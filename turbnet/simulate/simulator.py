@@ -33,7 +33,10 @@ from turbnet.simulate.phase_to_space import released
 from turbnet.simulate.plan import CONTRAST, TOLERANCE, Plan, Planner, contrast
 from turbnet.simulate.psf_basis import kernel_size, psf_basis
 from turbnet.simulate.sensor import Sensor, exposed
-from turbnet.simulate.tilt import upsample
+from turbnet.simulate.tilt import check_precision, upsample
+
+STRONGEST = 100.0
+"""Greatest D/r0: at 1000 light comes from a thousand pixels away, and a kernel of 31 pixels shows nothing of its blur."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +136,7 @@ class Simulator(nn.Module):
         self.strengths = strengths or (path.d_over_r0, path.d_over_r0)
         self._given = (modes, components, exact)
         check_range("stride", stride, 1, 64, "pixels")
+        check_range("D/r0", round(self.strengths[1], 9), 0.0, STRONGEST)
         self.stride = stride
         self._rigid = margin is not None
         self.margin = margin or 0
@@ -245,8 +249,8 @@ class Simulator(nn.Module):
             noise_seed: of the sensor.
 
         Raises:
-            InputError: the scene is of another size than the simulator, or holds values that are not finite; the draw
-                was made for another grid.
+            InputError: the scene is of another size than the simulator, is neither float32 nor float64, or holds values
+                that are not finite; the draw was made for another grid.
         """
         self._check(scene_BTCHW, draw)
         (batch, moments), channels = draw.coefficients.shape[:2], scene_BTCHW.shape[2]
@@ -318,6 +322,7 @@ class Simulator(nn.Module):
             )
         if self.wavelengths is not None and scene_BTCHW.shape[2] != len(self.wavelengths):
             raise InputError(f"the scene has {scene_BTCHW.shape[2]} channels for {len(self.wavelengths)} wavelengths")
+        check_precision(scene_BTCHW)
         if not bool(torch.isfinite(scene_BTCHW).all()):
             raise InputError("the scene holds NaN or infinite values")
         if not bool(torch.isfinite(draw.coefficients).all()):

@@ -23,6 +23,16 @@ _ITERATIONS = 12
 _SETTLED = 1e-3  # pixels
 
 
+def check_precision(image: Tensor) -> None:
+    """Refuse a picture in whose numbers neither places nor sums of light can be told.
+
+    Raises:
+        InputError: it is neither float32 nor float64.
+    """
+    if image.dtype not in (torch.float32, torch.float64):
+        raise InputError(f"pictures of {str(image.dtype)[6:]} cannot be simulated; give float32 or float64")
+
+
 def upsample(field_BChw: Tensor, stride: int, height: int, width: int) -> Tensor:
     """A coarse field interpolated bicubically to pixels: point (i, j) of the grid is pixel (i stride, j stride)."""
     *_, h, w = field_BChw.shape
@@ -36,7 +46,7 @@ def upsample(field_BChw: Tensor, stride: int, height: int, width: int) -> Tensor
 def sample(image_BCHW: Tensor, shift_B2HW: Tensor) -> Tensor:
     """image(x + shift(x)), bicubic, shift in pixels, x then y; outside the picture its border goes on."""
     grid = _grid(shift_B2HW)
-    return F.grid_sample(image_BCHW, grid, mode="bicubic", padding_mode="border", align_corners=True)
+    return F.grid_sample(image_BCHW, grid, mode="bicubic", padding_mode="border", align_corners=False)
 
 
 def displacement(tilt_B2hw: Tensor, stride: int) -> Tensor:
@@ -71,7 +81,7 @@ def tilt(image_BCHW: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
         stride: step of that grid, pixels.
 
     Raises:
-        InputError: the tilt holds values that are not finite.
+        InputError: the tilt holds values that are not finite; the picture is neither float32 nor float64.
     """
     if not bool(tilt_B2hw.detach().any()):
         return image_BCHW
@@ -81,7 +91,12 @@ def tilt(image_BCHW: Tensor, tilt_B2hw: Tensor, stride: int) -> Tensor:
 
 
 def splat(image_BCHW: Tensor, shift_B2HW: Tensor) -> Tensor:
-    """`tilt` with the shift of every pixel, (B, 2, H, W)."""
+    """`tilt` with the shift of every pixel, (B, 2, H, W).
+
+    Raises:
+        InputError: the picture is neither float32 nor float64.
+    """
+    check_precision(image_BCHW)
     moved: Tensor = _Splat.apply(image_BCHW, _grid(shift_B2HW))
     return moved
 
@@ -102,14 +117,14 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient_BCHW: Tensor) -> tuple[Tensor, Tensor]:
         image_BCHW, grid_BHW2 = ctx.saved_tensors
-        sampled = F.grid_sample(gradient_BCHW, grid_BHW2, mode="bicubic", padding_mode="zeros", align_corners=True)
+        sampled = F.grid_sample(gradient_BCHW, grid_BHW2, mode="bicubic", padding_mode="zeros", align_corners=False)
         return sampled, _sampling_adjoint(image_BCHW, gradient_BCHW, grid_BHW2, (False, True))[1]
 
 
 def _sampling_adjoint(
     gradient: Tensor, image: Tensor, grid: Tensor, wanted: tuple[bool, bool]
 ) -> tuple[Tensor, Tensor]:
-    bicubic, zeros, align_corners = 2, 0, True
+    bicubic, zeros, align_corners = 2, 0, False
     first, second = torch.ops.aten.grid_sampler_2d_backward(
         gradient.contiguous(), image.contiguous(), grid, bicubic, zeros, align_corners, list(wanted)
     )
@@ -117,10 +132,10 @@ def _sampling_adjoint(
 
 
 def _grid(shift_B2HW: Tensor) -> Tensor:
-    """x + shift(x) in the coordinates of `grid_sample`: pixel centres 0..N-1 at -1..1."""
+    """x + shift(x) in the coordinates of `grid_sample`: edges of the picture at -1 and 1, in which one pixel has a width."""
     *_, height, width = shift_B2HW.shape
     x = torch.arange(width, device=shift_B2HW.device, dtype=shift_B2HW.dtype)
     y = torch.arange(height, device=shift_B2HW.device, dtype=shift_B2HW.dtype)[:, None]
-    columns = (x + shift_B2HW[:, 0]) * (2 / max(width - 1, 1)) - 1
-    rows = (y + shift_B2HW[:, 1]) * (2 / max(height - 1, 1)) - 1
+    columns = (x + shift_B2HW[:, 0] + 0.5) * (2 / width) - 1
+    rows = (y + shift_B2HW[:, 1] + 0.5) * (2 / height) - 1
     return torch.stack((columns, rows), dim=-1)
