@@ -34,7 +34,7 @@ def test_checkpoint_to_model(checkpoint, tmp_path, capsys):
     assert run(["export", str(tmp_path / "last.ckpt"), "--json", str(report)]) == 0
     assert "largest difference from torch" in capsys.readouterr().out
     rows = json.loads(report.read_text())["rows"]
-    assert len(rows) == 5
+    assert len(rows) == 10
     assert all(row["ok"] for row in rows)
 
     model = Model.load(tmp_path / "last.onnx")

@@ -83,7 +83,7 @@ def sealed(model: onnx.ModelProto, card: Card) -> bytes:
 
 
 def compare(module: nn.Module, model: Model) -> list[Parity]:
-    """Run both on seeded noise of five shapes, none of them the export's."""
+    """Run both on seeded noise of ten shapes, none of them the export's."""
     unit, channels = model.card.size_multiple, model.card.channels
     generator = torch.Generator().manual_seed(0)
     rows = []
@@ -93,6 +93,11 @@ def compare(module: nn.Module, model: Model) -> list[Parity]:
         (1, 5, 9 * unit, 5 * unit),
         (3, 2, 5 * unit, 4 * unit),
         (1, model.card.frames + 1, 4 * unit, 11 * unit),
+        (2, 4, 7 * unit, 7 * unit),
+        (1, 2, 16 * unit, 4 * unit),
+        (4, 1, 5 * unit, 10 * unit),
+        (1, 7, 4 * unit, 5 * unit),
+        (2, 3, 9 * unit, 12 * unit),
     ]:
         shape = (batch, frames, channels, height, width)
         frames_BTCHW = torch.rand(shape, generator=generator)
