@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from turbnet.atmosphere.path import OpticalPath
+from turbnet.bench import precision
 from turbnet.bench.suite import Frames
 from turbnet.data.sources import embedded_paths, load_picture
 from turbnet.deploy.restore import ready, restore_frames, tiling_of, window_of
@@ -34,7 +35,7 @@ from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.simulator import Simulator
 
 SIZE, STRENGTH, BORDER = 256, 2.0, 8
-FAMILIES = ("speed", "skip", "start", "memory")
+FAMILIES = ("speed", "skip", "precision", "start", "memory")
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,15 @@ def run(models: Sequence[str], families: Sequence[str] = FAMILIES, quick: bool =
     work = [(name, family) for name in models for family in families if not (quick and family == "memory")]
     with progress_bar(quiet) as progress:
         for name, family in progress.track(work, description="restoring"):
-            for row in {"speed": _speed, "skip": _skip, "start": _start, "memory": _memory}[family](files[name], quick):
+            for row in _MEASURES[family](files[name], quick):
                 report.add(Row(f"{name}: {row.name}", row.value, row.unit))
     return report
 
 
 def table(report: Report) -> str:
     """The rows as Markdown."""
-    lines = [f"| {row.name} | {row.value:.3g} {row.unit} |" for row in report.rows]
+    values = [row.value if isinstance(row.value, str) else f"{row.value:.3g}" for row in report.rows]
+    lines = [f"| {row.name} | {value} {row.unit} |" for row, value in zip(report.rows, values, strict=True)]
     return "\n".join(["| figure | value |", "|---|---|", *lines])
 
 
@@ -176,3 +178,12 @@ def _memory(file: Path, quick: bool) -> list[Row]:
 def _command(file: Path, source: Path, target: Path) -> list[str]:
     options = [str(source), "-o", str(target), "--model", str(file), "--quiet"]
     return [sys.executable, "-m", "turbnet", "restore", *options]
+
+
+_MEASURES: dict[str, Callable[[Path, bool], list[Row]]] = {
+    "speed": _speed,
+    "skip": _skip,
+    "precision": precision.measure,
+    "start": _start,
+    "memory": _memory,
+}

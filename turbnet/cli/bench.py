@@ -125,7 +125,7 @@ def maps(
 def deployment(
     model: Annotated[list[str] | None, typer.Option(help="released network or ONNX file; may be given again")] = None,
     only: Annotated[
-        str | None, typer.Option(help="families to measure, of speed,skip,start,memory; comma-separated")
+        str | None, typer.Option(help="families to measure, of speed,skip,precision,start,memory; comma-separated")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="write the rows to this file")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="short clips, no memory: a minute or two")] = False,
