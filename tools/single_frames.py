@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from turbnet.atmosphere.path import OpticalPath
-from turbnet.bench.suite import SIZE, STRENGTHS, SUITES, make_clip
+from turbnet.bench.suite import SIZE, STRENGTHS, SUITES, Clip, make_clip
 from turbnet.classical.deconvolution import wiener
 from turbnet.deploy.checkpoint import load_network
 from turbnet.media.atomic import atomic_path
@@ -36,9 +36,7 @@ def main() -> int:
     parser.add_argument("--picture", type=Path, help="draw the maps")
     options = parser.parse_args()
     networks = {name: load_network(path)[0] for name, path in (item.split("=", 1) for item in options.checkpoints)}
-    scenes = range(SUITES["standard"].scenes)
-    clips = {(kind, s): [make_clip(kind, scene, s, 1) for scene in scenes] for kind in KINDS for s in STRENGTHS}
-
+    clips = benchmark()
     print("| single frames | " + " | ".join(f"{kind}, D/r0 = {s:g}" for kind, s in clips) + " |")
     print("|---" * (1 + len(clips)) + "|")
     line("input", [mean(lambda x: x, those) for those in clips.values()])
@@ -51,6 +49,12 @@ def main() -> int:
             parser.error("no checkpoint has maps to draw")
         draw(with_maps[0], options.picture)
     return 0
+
+
+def benchmark() -> dict[tuple[str, float], list[Clip]]:
+    """Clips of one frame, by kind and strength."""
+    scenes = range(SUITES["standard"].scenes)
+    return {(kind, s): [make_clip(kind, scene, s, 1) for scene in scenes] for kind in KINDS for s in STRENGTHS}
 
 
 def line(name: str, values: list[float]) -> None:

@@ -3,10 +3,11 @@
     python tools/train_released.py s --pictures FOLDER [--leg 9] [--gpu] [--output outputs/released] [--threads 2]
     python tools/train_released.py s --checkpoint FILE
 
-Trains `experiment=s` (or xs, m) on the pictures of folders or packs (tools/pack_pictures.py) and rendered text, goes on from
-the last checkpoint if any, measures the result on the standard benchmark, whose scenes are never trained on, and writes
-turbnet/weights/s.onnx and s.safetensors with their card. With --leg it stops after so many minutes if it has not finished;
-the same command goes on. With --checkpoint it trains nothing and releases what was trained elsewhere.
+Trains `experiment=s` (or xs, m, still) on the pictures of folders or packs (tools/pack_pictures.py) and rendered text, goes
+on from the last checkpoint if any, measures the result on the standard benchmark, whose scenes are never trained on, and
+writes turbnet/weights/s.onnx and s.safetensors with their card; the maps of `still` become maps.onnx as well. With --leg it
+stops after so many minutes if it has not finished; the same command goes on. With --checkpoint it trains nothing and
+releases what was trained elsewhere.
 """
 
 import argparse
@@ -20,13 +21,16 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 from safetensors.torch import save
+from single_frames import benchmark, mean, through
 
-from turbnet.deploy.checkpoint import card_of, load_network
+from turbnet.deploy.card import ModelCard
+from turbnet.deploy.checkpoint import card_of, load_network, maps_alone
 from turbnet.deploy.export import export_onnx, flush_denormals
 from turbnet.deploy.session import Model
+from turbnet.deploy.weights import MAPS
 from turbnet.weights.released import DIGEST
 
-WINDOW = {"xs": 32, "s": 32, "m": 32}
+WINDOW = {"xs": 32, "s": 32, "m": 32, "still": 1}
 """Frames restored together, as recommended to users."""
 
 MEASURES = {
@@ -38,7 +42,7 @@ MEASURES = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("net", choices=("xs", "s", "m"), help="which network")
+    parser.add_argument("net", choices=WINDOW, help="which network")
     parser.add_argument("--pictures", nargs="+", type=Path, default=[], help="clean pictures: folders, packs")
     parser.add_argument("--checkpoint", type=Path, help="release this one; no training")
     parser.add_argument("--data", default="photographs of a user's folder, rendered text", help="for the card")
@@ -99,27 +103,46 @@ def release(checkpoint: Path, options: argparse.Namespace) -> None:
     network, hyper_parameters = load_network(checkpoint)
     weights = save({key: value.contiguous() for key, value in flush_denormals(network).state_dict().items()})
     frames = WINDOW[options.net]
-    options.output.mkdir(parents=True, exist_ok=True)
-    path = options.output / f"{options.net}.onnx"
-    export_onnx(network, card_of(network, {**hyper_parameters, "recipe": {}}, frames), path)
-    measured = quality(path, options.suite)
+    if options.net == "still":
+        measured = {"measured by": "tools/single_frames.py; means over scenes", **single(network)}
+    else:
+        options.output.mkdir(parents=True, exist_ok=True)
+        path = options.output / f"{options.net}.onnx"
+        export_onnx(network, card_of(network, {**hyper_parameters, "recipe": {}}, frames), path)
+        by = f"turbnet bench restoration --suite {options.suite} --model {options.net}"
+        measured = {"measured by": f"{by}; means over scenes with 95 % intervals", **quality(path, options.suite)}
     hyper_parameters["recipe"] = {
         "data": options.data,
         "recipe": f"python tools/train_released.py {options.net} --pictures FOLDER",
         "steps": options.steps or torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"],
         "history": options.history,
-        "measured by": f"turbnet bench restoration --suite {options.suite} --model {options.net}; means over scenes with "
-        "95 % intervals",
         **measured,
         "known failures": options.failures,
         DIGEST: hashlib.sha256(weights).hexdigest(),
     }
+    card = card_of(network, hyper_parameters, frames)
+    if options.net == "still":
+        put(*maps_alone(network, card), options.weights / f"{MAPS}.onnx")
     path = options.weights / f"{options.net}.onnx"
-    for row in export_onnx(network, card_of(network, hyper_parameters, frames), path):
-        print(f"{row.shape}: largest difference from torch {row.difference:.1e}")
-    Model.load(path).card.write_beside(path)
+    put(network, card, path)
     path.with_suffix(".safetensors").write_bytes(weights)
     print(path.with_suffix(".md").read_text())
+
+
+def put(network: torch.nn.Module, card: ModelCard, path: Path) -> None:
+    """Write an ONNX file and its card."""
+    for row in export_onnx(network, card, path):
+        print(f"{row.shape}: largest difference from torch {row.difference:.1e}")
+    Model.load(path).card.write_beside(path)
+
+
+def single(network: torch.nn.Module) -> dict[str, str]:
+    """PSNR of single frames, by kind and strength."""
+    notes = {}
+    for (kind, strength), clips in benchmark().items():
+        before, after = mean(lambda x: x, clips), mean(lambda x: through(network, x), clips)
+        notes[f"PSNR, {kind}, D/r0 = {strength:g}"] = f"{after:.2f} (input {before:.2f})"
+    return notes
 
 
 def quality(model: Path, suite: str) -> dict[str, str]:
