@@ -65,6 +65,7 @@ def test_a_file(restorer, clip, tmp_path):
         (np.zeros((2, 8, 8, 3), np.int64), "int64"),
         (np.zeros((2, 8, 8, 3), bool), "bool"),
         (np.full((2, 8, 8, 3), np.nan, np.float32), "not numbers"),
+        (np.full((2, 8, 8, 3), 255.0, np.float32), "frame 0 holds values up to 255; scale"),
     ],
 )
 def test_what_cannot_be_restored(restorer, frames, says):

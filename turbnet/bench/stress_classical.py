@@ -21,7 +21,9 @@ def cells(quick: bool) -> Iterator[Cell]:
     sizes = ((1, 1), (5, 24)) if quick else ((1, 1), (1, 17), (5, 24), (40, 33))
     for method, content, (height, width), frames in product(METHODS, contents, sizes, (1, 3)):
         name = f"{method}, {content}, {height} x {width}, {frames} frames"
-        yield Cell("classical", name, partial(_restore, method, content, height, width, frames), content in BROKEN)
+        yield Cell(
+            "classical", name, partial(_restore, method, content, height, width, frames), content in (*BROKEN, "HDR")
+        )
     for method in METHODS:
         yield Cell("classical", f"{method}, linear up to 1e6", partial(_linear, method))
         yield Cell("classical", f"{method}, one core and two", partial(_cores, method))

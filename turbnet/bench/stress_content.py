@@ -31,6 +31,7 @@ def clip(content: str, height: int, width: int, frames: int = 1, channels: int =
         picture = ((torch.arange(height)[:, None] + torch.arange(width)) % 2).expand_as(texture).double()
     elif content == "HDR":
         picture = BRIGHTEST ** (2 * texture - 1)  # 1e-6 to 1e6
+        picture[middle] = BRIGHTEST
     else:
         picture = texture
     if content in BROKEN:

@@ -1,6 +1,7 @@
 """Stress of the released networks as they are used: `restore_array` and `turbnet.Restorer` over onnxruntime.
 
-Here NaN and Inf must be refused, and a flat picture must stay about flat: learned weights owe no more than that.
+Here NaN, Inf and values far above 1 must be refused, and a flat picture must stay about flat: learned weights owe no more
+than that.
 """
 
 from collections.abc import Iterator
@@ -28,7 +29,9 @@ def cells(quick: bool) -> Iterator[Cell]:
     for name in released_models():
         for content, (height, width), frames in product(CONTENTS, sizes, (1, 3)):
             title = f"{name}, {content}, {height} x {width}, {frames} frames"
-            yield Cell("models", title, partial(_restore, name, content, height, width, frames), content in BROKEN)
+            yield Cell(
+                "models", title, partial(_restore, name, content, height, width, frames), content in (*BROKEN, "HDR")
+            )
         for dtype in _DTYPES:
             yield Cell("models", f"{name}, {np.dtype(dtype)}", partial(_typed, name, dtype))
         yield Cell("models", f"{name}, int32", partial(_typed, name, np.int32), must_refuse=True)

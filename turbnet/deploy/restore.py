@@ -22,6 +22,7 @@ from turbnet.deploy.tiling import Tiling
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
 from turbnet.media.live import STANDARD, is_live
+from turbnet.media.readers import BRIGHTEST
 from turbnet.progress import progress_bar
 
 TILE, OVERLAP = 320, 32
@@ -75,13 +76,15 @@ def restore_frames(
         (H, W, C) float32 in [0, 1], one for each frame that comes in.
 
     Raises:
-        InputError: a frame holds values that are not finite, or the network returned such.
+        InputError: a frame holds values that are not finite or far outside [0, 1], or the network returned such.
     """
 
     def planes() -> Iterator[np.ndarray]:
         for index, frame_HWC in enumerate(frames):
             if not np.isfinite(frame_HWC).all():
                 raise InputError(f"frame {index} holds values that are not numbers (NaN or infinite); repair the clip")
+            if (largest := np.abs(frame_HWC).max()) > BRIGHTEST:
+                raise InputError(f"frame {index} holds values up to {largest:g}; scale floating-point frames to 0 to 1")
             yield np.moveaxis(frame_HWC, -1, 0)
 
     def restore_window(recent: list[np.ndarray]) -> np.ndarray:

@@ -45,7 +45,7 @@ class Restorer:
             frames_THWC: uint8 or uint16 of full scale, or floating point in [0, 1].
 
         Raises:
-            InputError: another shape or dtype, no frames, values that are not finite.
+            InputError: another shape or dtype, no frames, values that are not finite or far outside [0, 1].
         """
         clip = np.asarray(frames_THWC)
         if clip.ndim == 3:

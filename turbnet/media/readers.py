@@ -50,7 +50,7 @@ VIDEOS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts
 DEFAULT_FPS = 25.0
 
 # Filtering overshoots white by a little; twice white means that another scale was used.
-_LARGEST_FLOAT = 2.0
+BRIGHTEST = 2.0
 # FFmpeg's fast conversion of subsampled colour darkens a picture by a level; this one is unbiased.
 _ACCURATE = (
     Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
@@ -145,7 +145,7 @@ def _rgb(pixels: NDArray[Any], path: Path) -> Frame:
         raise InputError(f"cannot read {path}: pixels of type {pixels.dtype} have no known white level")
     elif not np.isfinite(pixels).all():
         raise InputError(f"{path} holds NaN or infinite pixels")
-    elif np.abs(pixels).max() > _LARGEST_FLOAT:
+    elif np.abs(pixels).max() > BRIGHTEST:
         raise InputError(f"{path} holds values up to {np.abs(pixels).max():g}; scale floating-point pixels to 0 to 1")
     pixels = pixels.astype(np.float32, copy=False)
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
