@@ -152,7 +152,7 @@ def test_broken_off_before_anything_is_kept_leaves_nothing(model, tmp_path):
 
 def test_a_model_that_carries_something_along_is_refused(model, tmp_path):
     source, network = clip(tmp_path / "in.mkv", 8), Model.load(model, 1)
-    network.card = replace(network.card, carried={"state": ("batch",)})
+    network.card = replace(network.card, carried={"state": {"shape": [4], "scale": 1}})
     with pytest.raises(InputError, match="leave --resume out"):
         restore_clip(source, tmp_path / "out.mkv", network, window=1, resume=True)
     assert [path.name for path in tmp_path.iterdir()] == ["in.mkv"]
