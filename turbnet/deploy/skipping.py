@@ -28,11 +28,11 @@ from turbnet.deploy.tiling import raised_cosine
 STILL = 0.1
 """RMS displacement, pixels, below which air does not matter."""
 
-_LOOKED_AT = 12  # frames of a window, equally spaced
+_LOOKED_AT = 12  # frames of a window, equally spaced, that tell the dance
 _BLOCK = 16
 _AROUND = 32  # pixels of context around what has changed
 _CHANGE = 0.012  # of a block's mean, full scale 1: three steps of eight bits
-_FLUCTUATION = 5.0  # standard errors
+_FLUCTUATION = 4.0  # standard errors
 _QUIET = 0.75 / 255  # RMS: the last bit of eight
 _EXPECTED, _RARE = 1.5 / 255, 0.995
 
@@ -96,13 +96,13 @@ class Skipping:
                 return frames_BTCHW
             self.skipped.restored += 1
             return self._network(frames_BTCHW)
-        looked = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))].mean(1)
-        moved = dance(looked)
+        grey = frames.mean(1)
+        moved = dance(grey[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))])
         if moved < STILL:
             self._kept[turn] = None
             self.skipped.clean += 1
             return frames_BTCHW
-        means, spread = _blocks(looked)
+        means, spread = _blocks(grey)
         # Only what stands still all the time stands for what comes; air moves no edge further than it dances.
         calm = spread < _CHANGE + moved / _BLOCK
         now = _Kept(means.mean(0), spread, calm & _same(means.mean(0), np.inf, spread, means), frames[0])
@@ -219,14 +219,16 @@ def _blocks(frames_THW: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _same(expected_hw: np.ndarray, behind: float, spread_hw: np.ndarray, means_Thw: np.ndarray) -> np.ndarray:
-    """Where a window, its first and its last third show what is expected, so that nothing passes through: (h, w).
+    """Where a window, each third of it and every four frames show what is expected, so that nothing passes through: (h, w).
 
     Args:
         behind: frames that what is expected was the mean of; infinite where it is the mean of these frames themselves.
     """
-    third = max(len(means_Thw) // 3, 1)
     same = np.ones(expected_hw.shape, bool)
-    for part in (means_Thw, means_Thw[:third], means_Thw[-third:]):
+    count = len(means_Thw)
+    for part in (
+        part for pieces in {1, min(3, count), max(count // 4, 1)} for part in np.array_split(means_Thw, pieces)
+    ):
         allowed = _CHANGE + _FLUCTUATION * spread_hw * np.sqrt(1 / len(part) + 1 / behind)
         same &= np.abs(part.mean(0) - expected_hw) <= allowed
     return same
