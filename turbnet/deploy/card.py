@@ -18,7 +18,7 @@ MAPS = "uncertainty maps"
 """Architecture on the card of a network that restores nothing but says where there is something to restore."""
 
 _LATER = ("carried",)  # fields that older files lack
-_CARRIED = 2**13  # greatest number of values carried for each pixel of a frame: 3 GB for a tile of 320 x 320
+_CARRIED = 2**15  # greatest number of values carried for each pixel of a frame: what m needs to remember 1000 frames
 
 
 class Card(ABC):
