@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbnet.atmosphere.path import OpticalPath
+from turbnet.bench.restoration import BORDER, psnr_moving
 from turbnet.bench.suite import make_clip
 from turbnet.cli.train import main as train
 from turbnet.deploy.checkpoint import load_network
@@ -41,7 +42,7 @@ from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.split_step import SplitStep, point_grid
 from turbnet.simulate.tilt import splat
 
-FRAMES, SCENES, STRENGTH, BORDER = 12, 4, 3.0, 8
+FRAMES, SCENES, STRENGTH = 12, 4, 3.0
 SIZE, STEP = 128, 16  # of the split-step clips and between their points, pixels
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -188,10 +189,10 @@ def measure(checkpoint: Path, output: Path) -> dict[str, float]:
             clip = make_clip(kind, scene, STRENGTH, FRAMES)
             restored = restore(clip.frames)
             if kind == "dynamic":
-                inner = (slice(None), slice(BORDER, -BORDER), slice(BORDER, -BORDER))
-                error, moving = ((restored - clip.target) ** 2).mean(-1)[inner], clip.moving[inner]
-                for where, pixels in (("where it moves", moving), ("where it does not", ~moving)):
-                    rows.setdefault(where, []).append(float(-10 * np.log10(error[pixels].mean())))
+                for where, value in zip(
+                    ("where it moves", "where it does not"), psnr_moving(restored, clip), strict=True
+                ):
+                    rows.setdefault(where, []).append(value)
             else:
                 rows.setdefault(kind, []).append(float(np.mean(psnr(restored, clip.target, BORDER))))
         frames, clean = split_step_clip(scene, output / "split-step")

@@ -22,13 +22,14 @@ def astronaut(size: int) -> torch.Tensor:
     return torch.from_numpy(load_picture(embedded_paths("test")[0])[:size, 120 : 120 + size]).permute(2, 0, 1)
 
 
-def sheet(pictures: list[np.ndarray], titles: list[str], path: Path) -> None:
-    """Pictures (H, W, 3) in [0, 1] in a row under their titles."""
-    size = pictures[0].shape[0]
-    whole = Image.new("RGB", (len(pictures) * (size + 4) - 4, size + 16), "white")
+def sheet(pictures: list[np.ndarray], titles: list[str], path: Path, columns: int | None = None) -> None:
+    """Square pictures (H, H, 3) in [0, 1] under their titles, row by row; `columns` None: all in one row."""
+    size, columns = pictures[0].shape[0], columns or len(pictures)
+    whole = Image.new("RGB", (columns * (size + 4) - 4, -(-len(pictures) // columns) * (size + 16)), "white")
     for index, (picture, title) in enumerate(zip(pictures, titles, strict=True)):
-        whole.paste(Image.fromarray((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)), (index * (size + 4), 16))
-        ImageDraw.Draw(whole).text((index * (size + 4) + 2, 2), title, fill="black")
+        left, top = index % columns * (size + 4), index // columns * (size + 16)
+        whole.paste(Image.fromarray((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)), (left, top + 16))
+        ImageDraw.Draw(whole).text((left + 2, top + 2), title, fill="black")
     with atomic_path(path) as temporary:
         whole.save(temporary, format="PNG", optimize=True)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from turbnet.bench.suite import SUITES, make_clip
 from turbnet.deploy.budget import CURVE, Setting, seconds_here
-from turbnet.deploy.restore import ready, restore_frames, tiling_of
+from turbnet.deploy.restore import restore_array
 from turbnet.deploy.session import Model
 from turbnet.deploy.weights import find_model, released_models
 from turbnet.media.atomic import atomic_path
@@ -36,12 +36,10 @@ def main() -> int:
     points = []
     for name in options.models:
         model = Model.load(find_model(name))
-        tiling = tiling_of(model)
         for window in options.windows:
             scores = []
             for clip in clips:
-                network = ready(model, tiling.count(*clip.frames.shape[1:3]))
-                out = np.stack(list(restore_frames(clip.frames, network, tiling, window)))
+                out = restore_array(clip.frames, model, window=window)
                 scores.append(psnr(out, clip.target, BORDER).mean())
             seconds = seconds_here(Setting(name, window, 0.0, 0.0))
             point = {"model": name, "window": window, "gain": float(np.mean(scores) - before), "seconds": seconds}

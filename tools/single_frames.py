@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
+from make_guide_figures import sheet
 
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.bench.suite import SIZE, STRENGTHS, SUITES, Clip, make_clip
 from turbnet.classical.deconvolution import wiener
 from turbnet.deploy.checkpoint import load_network
-from turbnet.media.atomic import atomic_path
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.metrics.fidelity import psnr
 from turbnet.nets.still import StillRestorer
@@ -111,13 +110,7 @@ def draw(network: StillRestorer, path: Path) -> None:
         "map of blur": grey(scale * blur),
         "error of what is restored": grey(scale * error),
     }
-    whole = Image.new("RGB", (3 * (SIZE + 4) - 4, 2 * (SIZE + 16)), "white")
-    for index, (title, picture) in enumerate(pictures.items()):
-        left, top = index % 3 * (SIZE + 4), index // 3 * (SIZE + 16)
-        whole.paste(Image.fromarray((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)), (left, top + 16))
-        ImageDraw.Draw(whole).text((left + 2, top + 2), title, fill="black")
-    with atomic_path(path) as temporary:
-        whole.save(temporary, format="PNG", optimize=True)
+    sheet(list(pictures.values()), list(pictures), path, columns=3)
 
 
 def grey(map_HW: np.ndarray) -> np.ndarray:

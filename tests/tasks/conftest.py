@@ -91,3 +91,23 @@ def batch():
     """A still scene of four frames."""
     picture = torch.from_numpy(skimage.data.astronaut()[100:132, 200:232].copy()).float().permute(2, 0, 1) / 255
     return {"scene": picture.expand(1, 4, 3, 32, 32), "seed": torch.tensor([3]), "hardness": torch.tensor([1.0])}
+
+
+@pytest.fixture(scope="session")
+def learn():
+    """Losses of steps on one batch with a warm-up of ten, as in training."""
+
+    def run(task, batch, steps, rate):
+        optimiser = torch.optim.AdamW(list(task.trained()), lr=rate, betas=(0.9, 0.99))
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: min(1.0, (step + 1) / 10))
+        losses = []
+        for _ in range(steps):
+            loss = task.training_step(batch, 0)
+            losses.append(float(loss.detach()))
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+        return losses
+
+    return run

@@ -22,23 +22,8 @@ def make(kind, d_over_r0=(3.0, 3.0), **more):
     return task
 
 
-def learn(task, batch, steps, rate):
-    """Losses of steps with a warm-up of ten, as in training."""
-    optimiser = torch.optim.AdamW(list(task.trained()), lr=rate, betas=(0.9, 0.99))
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: min(1.0, (step + 1) / 10))
-    losses = []
-    for _ in range(steps):
-        loss = task.training_step(batch, 0)
-        losses.append(float(loss.detach()))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-    return losses
-
-
 @pytest.mark.parametrize("weight", [0.0, 0.02])
-def test_tilt_removal_learns_one_clip_by_heart(batch, weight):
+def test_tilt_removal_learns_one_clip_by_heart(batch, weight, learn):
     """Two fifths and more of what true tilts would take off the loss go."""
     task = make(TiltRemoval, tilt_weight=weight)
     losses = learn(task, batch, 120, 5e-3)
@@ -48,14 +33,14 @@ def test_tilt_removal_learns_one_clip_by_heart(batch, weight):
     assert losses[-1] - floor < 0.6 * (losses[0] - floor)
 
 
-def test_restoration_learns_one_clip_by_heart(batch):
+def test_restoration_learns_one_clip_by_heart(batch, learn):
     """The gate's loss, an entropy, has a floor that nobody knows: it is left out."""
     losses = learn(make(Restoration, gate_weight=0.0), batch, 100, 2e-3)
     floor = 1e-3 + 0.01 * 0.1 + 0.4 * 1e-3
     assert losses[-1] - floor < 0.5 * (losses[0] - floor)
 
 
-def test_a_plain_unet_learns_one_clip_by_heart(batch):
+def test_a_plain_unet_learns_one_clip_by_heart(batch, learn):
     net = {"name": "unet", "widths": [8, 12, 16], "depths": [1, 1, 1]}
     task = Restoration(net=net, simulator={**SIMULATOR, "d_over_r0": [3.0, 3.0]})
     task.report = lambda *values: None
@@ -66,7 +51,7 @@ def test_a_plain_unet_learns_one_clip_by_heart(batch):
 
 
 @pytest.mark.parametrize("maps", [None, {"widths": [4, 6, 8], "depths": [1, 1, 1], "dropout": 0.1}])
-def test_a_still_restorer_learns_one_frame_by_heart_and_how_far_off_it_is(batch, maps):
+def test_a_still_restorer_learns_one_frame_by_heart_and_how_far_off_it_is(batch, maps, learn):
     net = {"name": "still", "widths": [8, 12, 16], "depths": [1, 1, 1], "maps": maps}
     task = Restoration(net=net, simulator={**SIMULATOR, "d_over_r0": [3.0, 3.0]})
     task.report = lambda *values: None

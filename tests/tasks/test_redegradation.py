@@ -29,22 +29,10 @@ def make(kind, form="linear", **more):
     return task
 
 
-def learn(task, batch, steps, rate=2e-3):
-    optimiser = torch.optim.AdamW(list(task.trained()), lr=rate, betas=(0.9, 0.99))
-    losses = []
-    for _ in range(steps):
-        loss = task.training_step(batch, 0)
-        losses.append(float(loss.detach()))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    return losses
-
-
 @pytest.mark.parametrize("form", ["linear", "physical"])
-def test_it_learns_one_clip_by_heart(form, batch):
+def test_it_learns_one_clip_by_heart(form, batch, learn):
     task = make(Redegradation, form)
-    losses = learn(task, batch, 60)
+    losses = learn(task, batch, 60, 2e-3)
     assert losses[-1] < losses[0]
     first, last = task.seen[0], task.seen[-1]
     for name in ("charbonnier", "true_redegraded"):
@@ -52,11 +40,11 @@ def test_it_learns_one_clip_by_heart(form, batch):
 
 
 @pytest.mark.parametrize("form", ["linear", "physical"])
-def test_without_truth_it_learns_to_give_what_was_seen(form, batch):
+def test_without_truth_it_learns_to_give_what_was_seen(form, batch, learn):
     """A few steps on one clip: what was restored explains it better and by a likelier blur, and the old is not forgotten."""
     task = make(Finetuning, form)
     clip = {"scene": task.pair(batch).frames, "seed": batch["seed"], "hardness": batch["hardness"]}
-    learn(task, {"clips": clip, "scenes": batch}, 40)
+    learn(task, {"clips": clip, "scenes": batch}, 40, 2e-3)
     first, last = task.seen[0], task.seen[-1]
     for name in ("unsupervised", "old_charbonnier"):
         assert last[name] < first[name], name

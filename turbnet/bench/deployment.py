@@ -21,7 +21,7 @@ from turbnet.atmosphere.path import OpticalPath
 from turbnet.bench import precision
 from turbnet.bench.suite import Frames
 from turbnet.data.sources import embedded_paths, load_picture
-from turbnet.deploy.restore import ready, restore_frames, tiling_of, window_of
+from turbnet.deploy.restore import restore_array, window_of
 from turbnet.deploy.session import Model
 from turbnet.deploy.skipping import Skipped
 from turbnet.deploy.weights import find_model
@@ -92,8 +92,7 @@ def static_camera(frames: int, strength: float) -> Scene:
             draw = simulator.draw([1], frames, None).centred()
             parts = []
             for k in range(0, frames, 8):  # all at once would need much memory
-                cut = type(draw)(draw.coefficients[:, k : k + 8], draw.stride, draw.margin, draw.q)
-                parts.append(simulator(linear[:, k : k + 8], cut, k).frames)
+                parts.append(simulator(linear[:, k : k + 8], draw.moments(k, k + 8), k).frames)
             seen = torch.cat(parts, dim=1)
         else:
             seen = linear
@@ -103,11 +102,8 @@ def static_camera(frames: int, strength: float) -> Scene:
 
 def restored(frames_THWC: Frames, model: Model, skipped: Skipped | None = None) -> tuple[Frames, float]:
     """The clip restored window by window, and how long that took, s."""
-    tiling = tiling_of(model)
     begun = time.perf_counter()
-    network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped)
-    out = np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model))))
-    return out, time.perf_counter() - begun
+    return restore_array(frames_THWC, model, skipped), time.perf_counter() - begun
 
 
 def _speed(file: Path, quick: bool) -> list[Row]:

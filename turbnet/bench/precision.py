@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from turbnet.bench.suite import SUITES, make_clip
-from turbnet.deploy.session import INPUT, available_cores
+from turbnet.deploy.session import INPUT, available_cores, open_session
 from turbnet.metrics.fidelity import psnr
 from turbnet.report import Row
 
@@ -32,7 +31,8 @@ def measure(file: Path, quick: bool = False) -> list[Row]:
     if quick:
         clips = clips[:1]
     with tempfile.TemporaryDirectory() as folder:
-        sessions = [_session(path) for path in (file, _quantised(file, Path(folder) / "int8.onnx"))]
+        files = (file, _quantised(file, Path(folder) / "int8.onnx"))
+        sessions = [open_session(path.read_bytes(), available_cores()) for path in files]
         scores: list[list[float]] = [[], []]
         ratios = []
         for clip in clips:
@@ -47,12 +47,6 @@ def measure(file: Path, quick: bool = False) -> list[Row]:
     faster, loss = float(np.median(ratios)), float(np.mean(scores[0]) - np.mean(scores[1]))
     worth = "yes" if faster >= FASTER and loss <= LOSS else "no"
     return [Row("int8: faster by", faster, "x"), Row("int8: loses", loss, "dB"), Row("int8: worth it", worth)]
-
-
-def _session(path: Path) -> Any:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.log_severity_level = available_cores(), 4
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def _quantised(source: Path, target: Path) -> Path:

@@ -179,7 +179,6 @@ def _score(restore: Restore, clip: Clip) -> Score:
     start = time.perf_counter()
     restored = restore(clip)
     seconds = time.perf_counter() - start
-    inner = (slice(None), slice(BORDER, -BORDER), slice(BORDER, -BORDER))
     score = Score(
         clip.kind,
         clip.strength,
@@ -191,14 +190,19 @@ def _score(restore: Restore, clip: Clip) -> Score:
     if clip.kind != "dynamic" and len(clip.frames) > 1:
         score.psnr_settled = float(np.mean(psnr(restored, clip.settled(), BORDER)))
     if clip.kind == "dynamic":
-        error, moving = ((restored - clip.target) ** 2).mean(-1)[inner], clip.moving[inner]
-        score.psnr_moving = float(-10 * np.log10(error[moving].mean()))
-        score.psnr_still = float(-10 * np.log10(error[~moving].mean()))
+        score.psnr_moving, score.psnr_still = psnr_moving(restored, clip)
     if clip.boxes:
         middle = restored[len(restored) // 2]
         read: TextScore = text_scorer("builtin")(middle, clip.boxes)
         score.cer = read.character_error_rate
     return score
+
+
+def psnr_moving(restored: Frames, clip: Clip) -> tuple[float, float]:
+    """PSNR where something moves and where nothing does, dB, over all frames at once."""
+    inner = (slice(None), slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+    error, moving = ((restored - clip.target) ** 2).mean(-1)[inner], clip.moving[inner]
+    return float(-10 * np.log10(error[moving].mean())), float(-10 * np.log10(error[~moving].mean()))
 
 
 def _mean(values: Iterable[float]) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """Stress of the whole simulator, and of the simple models beside it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import product
 
@@ -63,7 +64,7 @@ def _look(strength: float, content: str, height: int, width: int) -> Iterator[Ch
         yield within("frames of a uniform scene", seen.frames, brightest, brightest, _UNIFORM)
     leaf = scene.requires_grad_()
     coefficients = draw.coefficients.clone().requires_grad_()
-    looked = simulator(leaf, type(draw)(coefficients, draw.stride, draw.margin, draw.q)).frames
+    looked = simulator(leaf, replace(draw, coefficients=coefficients)).frames
     slopes = torch.autograd.grad(looked.sum(), (leaf, coefficients), allow_unused=True)
     yield finite("gradients", *(slope for slope in slopes if slope is not None))
     if content != "HDR":
@@ -84,7 +85,7 @@ def _double(strength: float) -> Iterator[Check]:
     path = OpticalPath.from_d_over_r0(strength)
     double = Simulator(path, 31, 18, dtype=torch.float64)
     scene, draw = clip("texture", 31, 18), double.draw([0])
-    single = type(draw)(draw.coefficients.float(), draw.stride, draw.margin, draw.q)
+    single = replace(draw, coefficients=draw.coefficients.float())
     exact, found = double(scene, draw).frames, _simulator(strength, 31, 18)(scene.float(), single).frames
     yield close("difference from float64", found, exact, 1e-4)
 

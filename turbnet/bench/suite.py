@@ -103,8 +103,7 @@ def make_clip(kind: str, scene: int, strength: float, frames: int) -> Clip:
     with torch.no_grad():
         # All moments at once, so that the camera points at the mean of the longest clip whatever is asked for.
         draw = simulator.draw([seed], max(LENGTHS), wind).centred()
-        cut = type(draw)(draw.coefficients[:, :frames], draw.stride, draw.margin, draw.q)
-        seen = simulator(to_linear(clean[:1] if still else clean)[None], cut, seed)
+        seen = simulator(to_linear(clean[:1] if still else clean)[None], draw.moments(0, frames), seed)
         shown = (to_srgb(seen.frames[0].clamp(0, 1)) * 255).round() / 255
     name = f"{kind} {scene + 1}, D/r0 = {strength:g}"
     frames_THWC = shown.permute(0, 2, 3, 1).numpy()

@@ -56,15 +56,9 @@ def simulator(
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bars")] = False,
 ) -> int:
     """Measure the in-loop simulator; exit code 1 if a row misses its limit."""
-    from turbnet.errors import InputError
-
     _check_outputs(json, figures)
     bench = importlib.import_module("turbnet.bench.simulator")
-    families = bench.FAMILIES if only is None else tuple(only.split(","))
-    unknown = [name for name in families if name not in bench.FAMILIES]
-    if unknown:
-        raise InputError(f"--only {only}: there is no family {unknown[0]!r}; they are {', '.join(bench.FAMILIES)}")
-    return _finish(bench, bench.run(families, quick=quick, quiet=quiet), json, figures)
+    return _finish(bench, bench.run(_families(bench, only), quick=quick, quiet=quiet), json, figures)
 
 
 def restoration(
@@ -133,15 +127,10 @@ def deployment(
 ) -> int:
     """Measure what restoring costs, with all released networks or with those that are named."""
     from turbnet.deploy.weights import released_models
-    from turbnet.errors import InputError
 
     _check_outputs(json, None)
     bench = importlib.import_module("turbnet.bench.deployment")
-    families = bench.FAMILIES if only is None else tuple(only.split(","))
-    unknown = [name for name in families if name not in bench.FAMILIES]
-    if unknown:
-        raise InputError(f"--only {only}: there is no family {unknown[0]!r}; they are {', '.join(bench.FAMILIES)}")
-    report = bench.run(model or list(released_models()), families, quick, quiet)
+    report = bench.run(model or list(released_models()), _families(bench, only), quick, quiet)
     print(bench.table(report))
     if json is not None:
         report.write(json)
@@ -162,6 +151,17 @@ def everything(
     report = importlib.import_module("turbnet.bench.page").write(output, quick, quiet)
     print(output / "bench.md")
     return 0 if report.ok else 1
+
+
+def _families(bench: Any, only: str | None) -> tuple[str, ...]:
+    """The families of a suite that --only names, or all of them."""
+    from turbnet.errors import InputError
+
+    families: tuple[str, ...] = bench.FAMILIES if only is None else tuple(only.split(","))
+    unknown = [name for name in families if name not in bench.FAMILIES]
+    if unknown:
+        raise InputError(f"--only {only}: there is no family {unknown[0]!r}; they are {', '.join(bench.FAMILIES)}")
+    return families
 
 
 def _check_outputs(json: Path | None, figures: Path | None) -> None:

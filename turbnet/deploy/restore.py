@@ -154,12 +154,15 @@ def window_of(model: Model | ClassicalMethod, window: int | None = None) -> int:
 
 
 def restore_array(
-    frames_THWC: np.ndarray, model: Model | ClassicalMethod, skipped: Skipped | None = None
+    frames_THWC: np.ndarray,
+    model: Model | ClassicalMethod,
+    skipped: Skipped | None = None,
+    window: int | None = None,
 ) -> np.ndarray:
-    """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would."""
+    """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would; `skipped` as in `ready`."""
     tiling = tiling_of(model)
     network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped)
-    return np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model))))
+    return np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model, window))))
 
 
 def window_overlap(window: int) -> int:

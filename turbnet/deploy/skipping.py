@@ -52,7 +52,7 @@ class Skipped:
         return (self.clean + self.still) / total if total else 0.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Kept:
     """What was restored, by block: its mean and fluctuation then, and whether it stood still; the picture (C, H, W)."""
 
@@ -105,20 +105,18 @@ class Skipping:
         means, spread = _blocks(grey)
         # Only what stands still all the time stands for what comes; air moves no edge further than it dances.
         calm = spread < _CHANGE + moved / _BLOCK
-        now = _Kept(means.mean(0), spread, calm & _same(means.mean(0), np.inf, spread, means), frames[0])
-        kept = self._kept[turn]
-        sides = frames.shape[2:]
-        boxes = [(slice(0, sides[0]), slice(0, sides[1]))]
+        now = means.mean(0), spread, calm & _same(means.mean(0), np.inf, spread, means)
+        kept, sides = self._kept[turn], frames.shape[2:]
+        known = np.zeros_like(calm)
         if kept is not None:
             known = calm & kept.steady & _same(kept.means, len(means), np.minimum(kept.spread, spread), means)
-            boxes = _around(~known, sides, self._multiple)
+        boxes = _around(~known, sides, self._multiple)
         area = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
         share = area / (sides[0] * sides[1])
         if kept is None or share >= 1:
             self.skipped.restored += 1
             restored = self._network(frames_BTCHW)
-            now.picture = restored.mean(1)[0]
-            self._kept[turn] = now
+            self._kept[turn] = _Kept(*now, restored.mean(1)[0])
             return restored
         self.skipped.restored += share
         self.skipped.still += 1 - share
@@ -128,10 +126,9 @@ class Skipping:
             weight = np.outer(*(_fade(part, side) for part, side in zip(box, sides, strict=True))).astype(np.float32)
             out[..., *box] += weight * (fresh - out[..., *box])
         if boxes:
-            now.picture = out.mean(1)[0]
-            for name in ("means", "spread", "steady"):
-                setattr(now, name, np.where(known, getattr(kept, name), getattr(now, name)))
-            self._kept[turn] = now
+            before = kept.means, kept.spread, kept.steady
+            means, spread, steady = (np.where(known, old, new) for old, new in zip(before, now, strict=True))
+            self._kept[turn] = _Kept(means, spread, steady, out.mean(1)[0])
         return out
 
 

@@ -43,6 +43,10 @@ class Draw:
         """Root-mean-square tilt-free phase over the aperture, (B, T, 1, h, w), rad: sqrt(a_4^2 + ... + a_J^2)."""
         return self.high.square().sum(2, keepdim=True).sqrt()
 
+    def moments(self, first: int, end: int) -> "Draw":
+        """The same atmosphere from one moment up to another."""
+        return replace(self, coefficients=self.coefficients[:, first:end])
+
     def centred(self) -> "Draw":
         """The same atmosphere seen by a camera that points at the clip's mean position: tilts sum to zero over a clip."""
         tilts = self.coefficients[:, :, :2]
