@@ -84,20 +84,22 @@ def static_camera(frames: int, strength: float) -> Scene:
         left = round(frame * (SIZE * 3 / 4) / max(frames // 2 - 1, 1))
         place = np.s_[frame, SIZE // 2 : SIZE * 3 // 4, left : left + SIZE // 4]
         clean[place] = clean[place] * (1 - share) + sprite * share
-    linear = to_linear(torch.from_numpy(clean).permute(0, 3, 1, 2))[None]
-    sensor = Sensor(20_000, 0.005)
-    with torch.no_grad():
-        if strength:
-            simulator = Simulator(OpticalPath.from_d_over_r0(strength), SIZE, SIZE, sensor=sensor)
-            draw = simulator.draw([1], frames, None).centred()
-            parts = []
-            for k in range(0, frames, 8):  # all at once would need much memory
-                parts.append(simulator(linear[:, k : k + 8], draw.moments(k, k + 8), k).frames)
-            seen = torch.cat(parts, dim=1)
-        else:
-            seen = linear
-        shown = (to_srgb(seen[0].clamp(0, 1)) * 255).round() / 255
-    return Scene(shown.permute(0, 2, 3, 1).numpy(), clean)
+    return Scene(through_air(clean, strength), clean)
+
+
+@torch.no_grad()
+def through_air(clean_THWC: Frames, strength: float) -> Frames:
+    """A clean clip as a camera sees it through independent air, 8 bits; strength is D/r0, 0 for clear air and no noise."""
+    seen = to_linear(torch.from_numpy(clean_THWC).permute(0, 3, 1, 2))[None]
+    if strength:
+        frames, height, width = clean_THWC.shape[:3]
+        simulator = Simulator(OpticalPath.from_d_over_r0(strength), height, width, sensor=Sensor(20_000, 0.005))
+        draw = simulator.draw([1], frames, None).centred()
+        # All at once would need much memory.
+        parts = [simulator(seen[:, k : k + 8], draw.moments(k, k + 8), k).frames for k in range(0, frames, 8)]
+        seen = torch.cat(parts, dim=1)
+    shown: Frames = ((to_srgb(seen[0].clamp(0, 1)) * 255).round() / 255).permute(0, 2, 3, 1).numpy()
+    return shown
 
 
 def restored(frames_THWC: Frames, model: Model, skipped: Skipped | None = None) -> tuple[Frames, float]:
