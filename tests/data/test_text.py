@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+from PIL import Image
 
 from turbnet.data.text import fonts, random_word, render_text
+from turbnet.data.words import WORDS
 
 
 def test_fonts_come_with_matplotlib():
@@ -32,6 +34,34 @@ def test_text_can_be_told_from_paper():
 
 
 def test_words():
-    words = [random_word(np.random.default_rng(seed)) for seed in range(200)]
-    assert {len(word) for word in words} == set(range(2, 9))
+    words = [random_word(np.random.default_rng(seed)) for seed in range(400)]
+    assert {len(word) for word in words} >= set(range(2, 11))
     assert all(word.isalnum() and word.isascii() for word in words)
+    # Half are letters and digits at random, 58 % of those with a digit: 0.29, three standard errors either way.
+    assert abs(np.mean([any(letter.isdigit() for letter in word) for word in words]) - 0.29) < 0.07
+    # Half of the words are syllables, hardly one of them a word of the benchmark.
+    assert np.mean([word.lower() in WORDS for word in words]) < 0.02
+
+
+def test_lines_are_turned():
+    """The strongest gradient of straight text is along the axes; of text turned by 6 to 12 degrees it is not."""
+    pictures = [render_text(np.random.default_rng(seed), 256, 256).mean(-1) for seed in range(60)]
+    angles = []
+    for picture in pictures:
+        # Orientation of the lines: the row projection is sharpest when the picture is turned back.
+        trials = np.arange(-14, 15, 2)
+        image = Image.fromarray((255 * picture).astype(np.uint8))
+        sums = [np.asarray(image.rotate(-t, Image.Resampling.BILINEAR))[64:192, 64:192].sum(1) for t in trials]
+        angles.append(trials[np.argmax([np.abs(np.diff(s.astype(float))).sum() for s in sums])])
+    straight = np.mean(np.array(angles) == 0)
+    assert 0.4 < straight < 0.8
+    assert np.max(np.abs(angles)) >= 8
+
+
+def test_the_light_falls_off():
+    """Towards either side, by at most two fifths; the median of a third of the picture is paper, mostly."""
+    pictures = [render_text(np.random.default_rng(seed), 96, 96).mean(-1) for seed in range(60)]
+    ratios = np.log([np.median(p[:, :32]) / np.median(p[:, 64:]) for p in pictures])
+    assert (ratios > 0.1).any()
+    assert (ratios < -0.1).any()
+    assert np.median(np.abs(ratios)) < -np.log(0.6)
