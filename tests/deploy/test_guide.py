@@ -27,7 +27,7 @@ def test_loader_without_turbnet(example, model_file, tmp_path, size):
     np.save(tmp_path / "frames.npy", frames_THWC)
     shutil.copy(model_file, tmp_path / "model.onnx")
     subprocess.run([sys.executable, "-c", example], cwd=tmp_path, check=True)
-    expected_TCHW = Tiling(128, 16, 4).apply(Model.load(model_file), frames_THWC.transpose(0, 3, 1, 2))
+    expected_TCHW = np.stack(Tiling(128, 16, 4).apply(Model.load(model_file), frames_THWC.transpose(0, 3, 1, 2)))
     expected_THWC = expected_TCHW.transpose(0, 2, 3, 1).clip(0, 1)
     np.testing.assert_allclose(np.load(tmp_path / "restored.npy"), expected_THWC, atol=1e-6)
 

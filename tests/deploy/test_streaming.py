@@ -77,7 +77,7 @@ def test_restoring_a_clip_frame_by_frame_in_tiles(model, tmp_path, tile):
     assert (done.frames, done.window, done.tiles) == (5, 1, 1 if tile == 384 else 2)
     seen, _ = read_clip(tmp_path / "in.tif")
     tiling = Tiling(tile, 8, 8)
-    expected = np.moveaxis(tiling.apply(model, np.moveaxis(seen, -1, 1)), 1, -1).clip(0, 1)
+    expected = np.moveaxis(np.stack(tiling.apply(model, np.moveaxis(seen, -1, 1))), 1, -1).clip(0, 1)
     np.testing.assert_allclose(read_clip(tmp_path / "out.tif")[0], expected, rtol=0, atol=2e-4)
 
 

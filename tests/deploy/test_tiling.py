@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from turbnet.deploy.tiling import Axis, Tiling, raised_cosine
+from turbnet.deploy.tiling import Axis, Tiling, packed, raised_cosine
 from turbnet.errors import ParameterError
 
 
@@ -69,6 +69,27 @@ def test_padding_is_by_reflection():
     np.testing.assert_array_equal(seen[0][0, 0, 0], np.tile([0, 1, 2, 1, 0, 1, 2, 1], (8, 1)))
 
 
+def test_eight_bits_are_kept_as_such_and_lose_nothing():
+    levels = np.arange(256, dtype=np.uint8).reshape(1, 16, 16)
+    frame = levels / np.float32(255)
+    assert packed(frame).dtype == np.uint8
+    (seen,) = Tiling(64, 8, 4).apply(lambda frames: frames, [packed(frame)])
+    assert seen.dtype == np.float32
+    np.testing.assert_array_equal(seen, frame)
+
+
+@pytest.mark.parametrize("value", [1e-7, 0.5, -1 / 255, 256 / 255, 1e6, 1 / 65535])
+def test_what_is_not_of_eight_bits_stays_what_it_is(value):
+    frame = np.full((1, 4, 4), value, np.float32)
+    assert packed(frame) is frame
+
+
+def test_frames_of_both_kinds_in_one_window():
+    frames = [np.full((1, 32, 32), 200 / np.float32(255), np.float32), np.full((1, 32, 32), 0.3, np.float32)]
+    for seen, frame in zip(Tiling(32, 8, 4).apply(lambda x: x, [packed(f) for f in frames]), frames, strict=True):
+        np.testing.assert_allclose(seen, frame, rtol=1e-6)
+
+
 def test_tiles_that_disagree_leave_no_seam():
     """Each tile is answered with its own number: the picture must pass smoothly from one to the next."""
     answers = iter([0.0, 1.0])
@@ -76,7 +97,7 @@ def test_tiles_that_disagree_leave_no_seam():
     def network(frames_BTCHW):
         return np.full_like(frames_BTCHW, next(answers))
 
-    restored = Tiling(64, 16, 4).apply(network, np.zeros((1, 1, 64, 112), np.float32))[0, 0, 0]
+    restored = Tiling(64, 16, 4).apply(network, np.zeros((1, 1, 64, 112), np.float32))[0][0, 0]
     assert restored[:40].max() == 0
     assert restored[-40:].min() == 1
     # The steepest step of a raised cosine over n pixels is pi / (2 n).

@@ -18,7 +18,7 @@ from turbnet.deploy.session import Carried, Model
 from turbnet.deploy.sidecar import Sidecar, identity
 from turbnet.deploy.skipping import Skipped, Skipping
 from turbnet.deploy.stream import stream, window_count
-from turbnet.deploy.tiling import Tiling
+from turbnet.deploy.tiling import Tiling, packed
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
 from turbnet.media.live import STANDARD, is_live
@@ -85,12 +85,10 @@ def restore_frames(
                 raise InputError(f"frame {index} holds values that are not numbers (NaN or infinite); repair the clip")
             if (largest := np.abs(frame_HWC).max()) > BRIGHTEST:
                 raise InputError(f"frame {index} holds values up to {largest:g}; scale floating-point frames to 0 to 1")
-            yield np.moveaxis(frame_HWC, -1, 0)
+            yield np.moveaxis(packed(frame_HWC), -1, 0)
 
-    def restore_window(recent: list[np.ndarray]) -> np.ndarray:
-        return tiling.apply(network, recent)
-
-    for index, restored_CHW in enumerate(stream(planes(), restore_window, window, window_overlap(window))):
+    restored = stream(planes(), partial(tiling.apply, network), window, window_overlap(window))
+    for index, restored_CHW in enumerate(restored):
         if not np.isfinite(restored_CHW).all():
             raise InputError(f"the network returned values that are not finite for frame {index}")
         yield np.moveaxis(restored_CHW, 0, -1).clip(0, 1)

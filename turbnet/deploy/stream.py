@@ -1,7 +1,7 @@
 """A clip of any length through a window of fixed length: overlapping windows, cross-faded, in bounded memory."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from turbnet.errors import check_range
 
 
 def stream(
-    frames: Iterable[np.ndarray], restore: Callable[[list[np.ndarray]], np.ndarray], window: int, overlap: int
+    frames: Iterable[np.ndarray], restore: Callable[[list[np.ndarray]], Sequence[np.ndarray]], window: int, overlap: int
 ) -> Iterator[np.ndarray]:
     """Restore frames through a sliding window; yield one frame for each that comes in, in order.
 
@@ -20,7 +20,7 @@ def stream(
 
     Args:
         frames: (C, H, W) each, float32.
-        restore: T frames (C, H, W) -> (T, C', H, W), for any T up to `window`.
+        restore: T frames (C, H, W) -> T frames (C', H, W), for any T up to `window`.
         window: frames restored together, >= 1.
         overlap: frames that successive windows share, 0 to window/2.
 
@@ -44,7 +44,7 @@ def stream(
         fresh += 1
         if len(tail) + fresh == window:
             restored = restore_recent()
-            tail, fresh = [frame.copy() for frame in restored[window - overlap :]], 0  # or the whole window stays alive
+            tail, fresh = restored[window - overlap :], 0
             yield from restored[: window - overlap]
             del restored
     yield from restore_recent() if fresh else tail
