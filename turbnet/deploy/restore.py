@@ -22,7 +22,7 @@ from turbnet.deploy.tiling import Tiling, packed
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
 from turbnet.media.live import STANDARD, is_live
-from turbnet.media.readers import BRIGHTEST
+from turbnet.media.source import BRIGHTEST
 from turbnet.progress import progress_bar
 
 TILE, OVERLAP = 320, 32

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from turbnet.errors import InputError
-from turbnet.media.readers import ClipInfo, Frame, Source, TimedFrame, open_source
+from turbnet.media.readers import open_source
 from turbnet.media.sound import Sound
+from turbnet.media.source import ClipInfo, Frame, Source, TimedFrame
 from turbnet.media.writers import ClipWriter, open_writer, write_clip
 
 __all__ = ["ClipInfo", "ClipReader", "ClipWriter", "open_clip", "open_writer", "read_clip", "write_clip"]
