@@ -19,8 +19,9 @@ from turbnet.nets.redegradation import (
     at_pixels,
     code_of,
 )
-from turbnet.simulate.simple import equivalent_sigma, short_exposure_sigma, theoretical_tilt_std
+from turbnet.simulate.simple import theoretical_tilt_std
 from turbnet.simulate.simulator import Simulator
+from turbnet.simulate.width import equivalent_sigma, short_exposure_sigma
 
 CONFIG = {"name": "redegrading", "restorer": {"name": "still", "widths": [4, 4, 4], "depths": [1, 1, 1]}}
 

@@ -17,15 +17,9 @@ from turbnet.simulate.draw import TILT_PIXELS
 from turbnet.simulate.field import ZernikeField
 from turbnet.simulate.psf_basis import tilt_free_psf
 from turbnet.simulate.sensor import Sensor
-from turbnet.simulate.simple import (
-    DirectToImage,
-    GaussianDraw,
-    WarpBlur,
-    equivalent_sigma,
-    short_exposure_sigma,
-    width_statistics,
-)
+from turbnet.simulate.simple import DirectToImage, GaussianDraw, WarpBlur
 from turbnet.simulate.tilt import sample, upsample
+from turbnet.simulate.width import equivalent_sigma, short_exposure_sigma, width_statistics
 
 PATH = OpticalPath.from_d_over_r0(3.0)
 STILL = OpticalPath(0.2, 7000.0, Constant(0.0))

@@ -94,12 +94,16 @@ class ClipData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Fresh clips every epoch."""
-        rank = self.trainer.global_rank if self.trainer else 0
-        world = self.trainer.world_size if self.trainer else 1
-        self.train.batch = self.batch_size * world
+        sampler = self._sampler()
+        self.train.batch = self.batch_size * sampler.num_replicas
         self.train.curriculum = self.curriculum * self.train.batch
-        return self._loader(self.train, EpochSampler(len(self.train), rank, world))
+        return self._loader(self.train, sampler)
 
     def val_dataloader(self) -> DataLoader[Any]:
         """The same clips every time."""
         return self._loader(self.val, None)
+
+    def _sampler(self) -> EpochSampler:
+        """This process's share of an epoch."""
+        ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        return EpochSampler(len(self.train), *ranks)

@@ -35,8 +35,8 @@ from turbnet.media.colour import to_linear, to_srgb
 from turbnet.nets.blocks import ResidualBlock, conv3x3, warp, zero_start
 from turbnet.nets.tilt import Registered, TiltNet
 from turbnet.simulate.draw import TILT_PIXELS, Draw
-from turbnet.simulate.simple import STRONGEST, short_exposure_sigma
 from turbnet.simulate.simulator import Simulator
+from turbnet.simulate.width import STRONGEST, short_exposure_sigma
 
 CELL = 16
 """Side of the cells that a code describes, pixels."""

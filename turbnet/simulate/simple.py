@@ -9,40 +9,30 @@ Both have the contract of `turbnet.simulate.simulator.Simulator`: a draw is a va
 applying it a differentiable function; tilt comes first and blur second, both indexed by the source point; air without
 turbulence leaves the scene as it is.
 
-Widths are equivalent widths: the Gaussian as sharp as a point-spread function b or transfer function H,
-
-.. math:: \frac{1}{4\pi\sigma^2} = \sum_x b(x)^2 = \int |H(f)|^2\, d^2f,
-
-which exists where the second moment of a diffraction-limited spot does not, and does not depend on where the spot is.
+Widths are equivalent widths, see `turbnet.simulate.width`.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.fft import next_fast_len
-from scipy.interpolate import BSpline, make_interp_spline
 from torch import Tensor, nn
 
 from turbnet.atmosphere.covariance import zernike_covariance
-from turbnet.atmosphere.exposure import tilt_free_otf
-from turbnet.atmosphere.noll import noll_covariance, noll_matrix
+from turbnet.atmosphere.noll import noll_covariance
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import InputError, check_range
 from turbnet.simulate.draw import TILT_PIXELS
 from turbnet.simulate.field import ZernikeField
-from turbnet.simulate.psf_basis import tilt_free_psf
 from turbnet.simulate.sensor import Sensor
 from turbnet.simulate.tilt import tilt, upsample
 from turbnet.simulate.white import white_noise
+from turbnet.simulate.width import STRONGEST, short_exposure_sigma, width_statistics
 
-STRONGEST = 10.0
-"""Largest D/r0 of the simple models."""
-
-_STRENGTHS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.5, 8.0, STRONGEST])
 _WIDTHS = 6  # Gaussians between which the widths of a field are interpolated
 _TILT_REACH, _BLUR_REACH = 4.0, 3.0  # standard deviations from beyond the edge that reach into the picture
 
@@ -398,55 +388,9 @@ class DirectToImage(_GaussianModel):
         return nodes[None], upsample(shares, self.stride, full[0], full[1])
 
 
-def equivalent_sigma(psf_Pkk: Tensor) -> Tensor:
-    """Standard deviation of the Gaussian as sharp as each PSF, (P,), pixels."""
-    return (4 * np.pi * psf_Pkk.square().sum((-2, -1))).rsqrt()
-
-
 def theoretical_tilt_std(d_over_r0: float) -> float:
     """Standard deviation of either component of the tilt of one point, Nyquist pixels."""
     return float(TILT_PIXELS * np.sqrt(noll_covariance(2, 2) * d_over_r0 ** (5 / 3)))
-
-
-def short_exposure_sigma(d_over_r0: float) -> float:
-    """Equivalent width of the mean tilt-free PSF of all Zernike modes, diffraction included, Nyquist pixels.
-
-    Raises:
-        ParameterError: D/r0 outside 0 .. 10.
-    """
-    return float(np.exp(_short_exposure_table()(check_range("D/r0", d_over_r0, 0.0, STRONGEST))))
-
-
-def width_statistics(d_over_r0: float) -> tuple[float, float]:
-    """Mean and standard deviation of the equivalent width of single tilt-free PSFs (`tilt_free_psf`), Nyquist pixels.
-
-    Raises:
-        ParameterError: D/r0 outside 0 .. 10.
-    """
-    mean, spread = _width_table()(check_range("D/r0", d_over_r0, 0.0, STRONGEST))
-    return float(mean), float(max(spread, 0.0))
-
-
-@lru_cache(maxsize=1)
-def _short_exposure_table() -> BSpline:
-    """log sigma over D/r0."""
-    x, weight = np.polynomial.legendre.leggauss(12)
-    frequency = 0.5 * (x + 1)  # in units of the cutoff, half a cycle per pixel
-    area = 2 * np.pi * 0.25 * 0.5 * weight * frequency
-    sharpness = np.array([area @ tilt_free_otf(frequency, strength) ** 2 for strength in _STRENGTHS])
-    return make_interp_spline(_STRENGTHS, -0.5 * np.log(4 * np.pi * sharpness), k=3)
-
-
-@lru_cache(maxsize=1)
-def _width_table(modes: int = 36, samples: int = 4000) -> BSpline:
-    """Mean and spread over D/r0, from the same seeded Kolmogorov draws at every strength."""
-    factor = torch.as_tensor(np.linalg.cholesky(noll_matrix(range(4, modes + 1))), dtype=torch.float32)
-    high = torch.randn(samples, modes - 3, generator=torch.Generator().manual_seed(0)) @ factor.T
-    rows = []
-    for strength in _STRENGTHS:
-        widths = equivalent_sigma(torch.cat([tilt_free_psf(part) for part in (high * strength ** (5 / 6)).split(500)]))
-        rows.append((float(widths.mean()), float(widths.std())))
-    return make_interp_spline(_STRENGTHS, np.array(rows), k=3)
 
 
 def _relative_width(strength: float, own: float) -> float:
