@@ -55,13 +55,18 @@ class Footage(Dataset[Scene]):
         self._room = [self._room_in(path) for path in self.paths]
 
     def __getitem__(self, index: int) -> Scene:
+        path, first, top, left, seed = self.place(index)
+        with open_clip(path, (left, top, self.width, self.height)) as clip:
+            cut = np.stack(list(islice(clip, first, first + self.frames)))
+        scene = torch.from_numpy(cut).permute(0, 3, 1, 2).clamp(0, 1).contiguous()
+        return {"scene": scene, "seed": torch.tensor(seed), "hardness": torch.tensor(1.0)}
+
+    def place(self, index: int) -> tuple[Path, int, int, int, int]:
+        """Clip, first frame, top and left of cut number `index`, and its seed."""
         rng = np.random.default_rng([self.seed, index])
         which = int(rng.integers(len(self.paths)))
         first, top, left = (int(rng.integers(room + 1)) for room in self._room[which])
-        with open_clip(self.paths[which], (left, top, self.width, self.height)) as clip:
-            cut = np.stack(list(islice(clip, first, first + self.frames)))
-        scene = torch.from_numpy(cut).permute(0, 3, 1, 2).clamp(0, 1).contiguous()
-        return {"scene": scene, "seed": torch.tensor(int(rng.integers(2**62))), "hardness": torch.tensor(1.0)}
+        return self.paths[which], first, top, left, int(rng.integers(2**62))
 
     def _room_in(self, path: Path) -> tuple[int, int, int]:
         """By how much a cut may start late, low and far right."""

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.nets.redegradation import Code
-from turbnet.tasks.losses import charbonnier
+from turbnet.tasks.losses import charbonnier, frequency_loss
 from turbnet.tasks.redegradation import Redegradation
 
 
@@ -16,42 +16,44 @@ class Finetuning(Redegradation):
     Every restored frame J_t, degraded by the code z_s of a frame s of the same clip, must give that frame:
 
     .. math::
-        L = d(D(J_t, z_t), I_t) + d(D(J_t, z_s), I_s) + \lambda_a\, d(J_t, \bar J) + \lambda_p\, \mathrm{prior}(z)
+        L = d(D(J_t, z_t), I_t) + d(D(J_t, z_s), I_s) + \lambda_f\, d(J_t, F) + \lambda_p\, \mathrm{prior}(z)
 
-    The second term is what teaches: what is particular to frame t, its noise and its tilt, is not in frame s. The prior ties
-    the blur to the dance of the frames. Beside it the old lessons go on, on simulated pairs, so that nothing is forgotten.
+    What is particular to frame t, its noise and its tilt, is not in frame s. All frames must agree on F, what a classical
+    method makes of the whole clip: many frames know what one does not. The prior ties the blur to the dance of the frames.
+    Beside it the old lessons go on, on simulated pairs, so that nothing is forgotten.
 
     Args:
-        agree_weight: lambda_a, of the distance of restored frames to their mean.
+        agree_weight: lambda_f, of the distance of restored frames to F, which is that of the supervised loss.
         prior_weight: lambda_p.
         rehearsal_weight: of the supervised loss on simulated pairs.
         more: see `Redegradation`.
     """
 
     def __init__(
-        self, agree_weight: float = 0.3, prior_weight: float = 0.02, rehearsal_weight: float = 1.0, **more: Any
+        self, agree_weight: float = 1.0, prior_weight: float = 0.02, rehearsal_weight: float = 1.0, **more: Any
     ) -> None:
         super().__init__(
             agree_weight=agree_weight, prior_weight=prior_weight, rehearsal_weight=rehearsal_weight, **more
         )
 
-    def unsupervised(self, frames_BTCHW: Tensor, shift: int) -> tuple[Tensor, dict[str, Tensor]]:
+    def unsupervised(self, frames_BTCHW: Tensor, fused_BCHW: Tensor, shift: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of clips without truth, and what it is made of; frame t is compared with frame t + shift as well."""
         net = self.net
         restored, code = net.restorer(frames_BTCHW), net.code(frames_BTCHW)
         own = charbonnier(net.degradation(restored, code), frames_BTCHW)
         other = Code(*(part.roll(-shift, dims=1) for part in code))
         cross = charbonnier(net.degradation(restored, other), frames_BTCHW.roll(-shift, dims=1))
-        agree = charbonnier(restored, restored.mean(1, keepdim=True).expand_as(restored))
+        still = fused_BCHW[:, None].expand_as(restored)
+        agree = charbonnier(restored, still) + self.hparams["frequency_weight"] * frequency_loss(restored, still)
         prior = net.degradation.prior(code)
         loss = own + cross + self.hparams["agree_weight"] * agree + self.hparams["prior_weight"] * prior
         return loss, {"redegraded": own, "cross": cross, "agree": agree, "prior": prior}
 
     def step(self, batch: dict[str, Scene | SimulatedScene], stage: str) -> Tensor:  # type: ignore[override]
-        clips = batch["clips"]["scene"]  # type: ignore[typeddict-item]
-        count = clips.shape[1]
-        shift = 1 + int(batch["clips"]["seed"][0]) % max(count - 1, 1)
-        loss, values = self.unsupervised(clips.float(), shift)
+        cuts: dict[str, Tensor] = batch["clips"]  # type: ignore[assignment]
+        clips = cuts["scene"].float()
+        shift = 1 + int(cuts["seed"][0]) % max(clips.shape[1] - 1, 1)
+        loss, values = self.unsupervised(clips, cuts["fused"].float(), shift)
         values["unsupervised"] = loss
         old, known, _ = self.supervised(self.pair(batch["scenes"]))
         loss = loss + self.hparams["rehearsal_weight"] * old
