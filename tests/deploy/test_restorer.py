@@ -107,3 +107,15 @@ print({learning} & set(sys.modules))
     assert done.stdout.split() == ["set()", "set()"], done.stdout + done.stderr
     with pytest.raises(AttributeError, match="nothing_of_the_kind"):
         _ = turbnet.nothing_of_the_kind
+
+
+def test_files_with_skipping_or_to_be_resumed(restorer, tmp_path):
+    clip = np.full((6, 32, 40, 3), 0.5, np.float32)
+    write_clip(tmp_path / "in.mkv", clip)
+    done = restorer.restore(tmp_path / "in.mkv", tmp_path / "skipped.mkv", skip=True)
+    assert done.skipped.saved == 1
+    np.testing.assert_allclose(read_clip(tmp_path / "skipped.mkv")[0], clip, atol=0.51 / 255)
+    done = restorer.restore(tmp_path / "in.mkv", tmp_path / "out.mkv", resume=True)
+    assert (done.frames, done.resumed) == (6, 0)
+    with pytest.raises(InputError, match="leave --resume or --skip out"):
+        restorer.restore(tmp_path / "in.mkv", tmp_path / "both.mkv", skip=True, resume=True)

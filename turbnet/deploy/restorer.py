@@ -74,9 +74,20 @@ class Restorer:
             full = _full_scale(dtype)
             yield restored.astype(dtype) if full == 1 else (restored * full + 0.5).astype(dtype)
 
-    def restore(self, source: str | Path, destination: str | Path, passes: int = 1) -> Restoration:
-        """A clip from file to file, as `turbnet restore`; what was done comes back."""
-        return restore_clip(source, destination, self.model, tile=self.tiling.tile, window=self.window, passes=passes)
+    def restore(
+        self, source: str | Path, destination: str | Path, passes: int = 1, skip: bool = False, resume: bool = False
+    ) -> Restoration:
+        """A clip from file to file, as `turbnet restore`; what was done comes back. Arguments: see `restore_clip`."""
+        return restore_clip(
+            source,
+            destination,
+            self.model,
+            tile=self.tiling.tile,
+            window=self.window,
+            passes=passes,
+            skip=skip,
+            resume=resume,
+        )
 
 
 def _full_scale(dtype: np.dtype[Any]) -> float:
