@@ -173,6 +173,8 @@ def test_the_extra_is_named_when_it_is_missing(texts, capsys, monkeypatch):
         ("tiny.png", "tiny.png", [], "at least 11x11 must remain"),
         ("still.png", "still.png", ["--border", "40"], "too small for a border of 40"),
         ("missing.mp4", "still.png", [], "there is no file or folder"),
+        ("-", "still.png", [], "save the pipe or camera to a file first"),
+        ("still.png", "-", [], "save the pipe or camera to a file first"),
         ("still.png", "still.png", ["--json", "none/m.json"], "does not exist; create it first"),
     ],
 )

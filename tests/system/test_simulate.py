@@ -146,6 +146,19 @@ def test_bad_input_is_one_line(tmp_path, photo, arguments, complaint):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_pipe_gives_what_its_file_gives(tmp_path):
+    clip = np.random.default_rng(0).random((5, 32, 40, 3), dtype=np.float32)
+    write_clip(tmp_path / "in.mkv", clip)
+    options = ["--d-over-r0", "2", "--seed", "3", "--quiet"]
+    assert simulate(tmp_path, "in.mkv", "-o", "file.mkv", *options).returncode == 0
+    command = [sys.executable, "-m", "turbnet", "simulate", "-", "-o", "pipe.mkv", *options]
+    done = subprocess.run(
+        command, cwd=tmp_path, input=(tmp_path / "in.mkv").read_bytes(), capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert (tmp_path / "pipe.mkv").read_bytes() == (tmp_path / "file.mkv").read_bytes()
+
+
 def test_it_never_imports_lightning(tmp_path, photo):
     code = (
         "import sys; from turbnet.cli import run; "

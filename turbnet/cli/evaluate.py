@@ -51,6 +51,7 @@ def evaluate(
 
     from turbnet.media.atomic import check_output
     from turbnet.media.clip import open_clip
+    from turbnet.media.live import is_live
     from turbnet.progress import progress_bar
     from turbnet.report import Report
 
@@ -58,6 +59,9 @@ def evaluate(
         check_output(json)
     if restored is None and (boxes is None or reference or input):
         raise InputError("give --restored, the clip to score, or --boxes, a table of the files to read text in")
+    for path in (restored, reference, input):
+        if path is not None and is_live(path):
+            raise InputError("a clip is passed over more than once; save the pipe or camera to a file first")
     clips = {name: open_clip(path) for name, path in (("restored", restored), ("input", input)) if path}
     target = open_clip(reference) if reference else None
     for clip in clips.values():

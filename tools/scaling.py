@@ -1,0 +1,118 @@
+"""How quality rises with training compute: xs, s and m trained from scratch by one recipe, on one plot.
+
+    python tools/scaling.py --pictures FOLDER [--steps xs=800 s=400 m=200] [--frames 8] [--output outputs/scaling]
+
+Trains every network on clips of 1 to so many frames, resumable, and validates it on the same clips as it goes. Prints a
+table and draws docs/images/scaling.png: PSNR on the validation clips against what the training had cost by then, counted in
+multiplications and additions of the network, forward and backward (three times forward); the simulator is not counted.
+"""
+
+import argparse
+import csv
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import torch
+from omegaconf import OmegaConf
+from torch.utils.flop_counter import FlopCounterMode
+
+from turbnet.media.atomic import atomic_path
+from turbnet.nets import build
+from turbnet.tasks.checkpoint import read_checkpoint
+
+SIZE, BATCH, EPOCH = 128, 3, 20
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pictures", nargs="+", type=Path, required=True, help="clean pictures: folders, packs")
+    parser.add_argument("--steps", nargs="+", default=["xs=800", "s=400", "m=200"], metavar="NET=N")
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--output", type=Path, default=Path("outputs/scaling"))
+    parser.add_argument("--figure", type=Path, default=Path("docs/images/scaling.png"))
+    parser.add_argument(
+        "--set", dest="overrides", nargs="+", default=[], metavar="KEY=VALUE", help="of the configuration"
+    )
+    options = parser.parse_args()
+    curves = {}
+    for name, steps in (entry.split("=") for entry in options.steps):
+        folder = train(name, int(steps), options)
+        cost = 3 * step_flops(folder, options.frames)
+        curves[name] = [(step, step * cost, quality) for step, quality in history(folder)]
+    lines = ["| network | steps | PFLOP | PSNR, dB |", "|---|---|---|---|"]
+    for name, curve in curves.items():
+        lines += [f"| {name} | {step} | {flops / 1e15:.2f} | {quality:.2f} |" for step, flops, quality in curve]
+    print("\n".join(lines))
+    with atomic_path(options.output / "scaling.json") as temporary:
+        temporary.write_text(json.dumps(curves, indent=2) + "\n")
+    draw(curves, options.figure)
+    return 0
+
+
+def train(name: str, steps: int, options: argparse.Namespace) -> Path:
+    """Train one network, or go on, or leave what is finished; its folder."""
+    folder: Path = options.output / name
+    last = folder / "checkpoints/last.ckpt"
+    epochs = math.ceil(steps / EPOCH)
+    if last.is_file() and read_checkpoint(last)["epoch"] + 1 >= epochs:
+        return folder
+    pictures = ",".join(str(path.resolve()) for path in options.pictures)
+    arguments = [
+        f"experiment={name}",
+        "data=folders",
+        f"data.folders=[{pictures}]",
+        f"data.frames=[1,{options.frames}]",
+    ]
+    arguments += [f"data.size={SIZE}", f"data.batch_size={BATCH}", f"data.steps_per_epoch={EPOCH}", "data.val_clips=6"]
+    arguments += [f"data.curriculum={steps // 4}", "data.text=0.25", "data.moving=0.25", "callbacks=quiet"]
+    arguments += [f"trainer.max_epochs={epochs}", f"trainer.check_val_every_n_epoch={math.gcd(epochs, 2)}"]
+    arguments += [f"output={folder.resolve()}", f"threads={options.threads}", *options.overrides]
+    arguments += [f"resume={last.resolve()}"] if last.is_file() else []
+    subprocess.run([sys.executable, "-m", "turbnet", "train", *arguments], check=True)
+    return folder
+
+
+def step_flops(folder: Path, most: int) -> float:
+    """Of a forward pass of a step on average: clips have 1 to `most` frames, equally likely on a logarithmic scale."""
+    network = build(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml").net, resolve=True)).eval()
+    counts = []
+    for frames in (1, most):
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            network(torch.rand(1, frames, 3, SIZE, SIZE))
+        counts.append(counter.get_total_flops())
+    edges = [math.log(n) for n in range(1, most + 2)]
+    mean = sum(n * (b - a) / edges[-1] for n, (a, b) in enumerate(zip(edges, edges[1:], strict=False), start=1))
+    return BATCH * (counts[0] + (counts[1] - counts[0]) * (mean - 1) / (most - 1))
+
+
+def history(folder: Path) -> list[tuple[int, float]]:
+    """Steps taken and PSNR of the averaged weights on the validation clips, of all legs."""
+    found = {}
+    for path in sorted(folder.glob("csv/version_*/metrics.csv")):
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                if row.get("val/psnr"):
+                    found[int(row["step"]) + 1] = float(row["val/psnr"])
+    return sorted(found.items())
+
+
+def draw(curves: dict[str, list[tuple[int, float, float]]], path: Path) -> None:
+    figure, axis = plt.subplots(figsize=(5.5, 3.6), layout="constrained")
+    for (name, curve), marker in zip(curves.items(), "os^vD", strict=False):
+        axis.plot(
+            [flops / 1e15 for _, flops, _ in curve], [quality for *_, quality in curve], marker=marker, label=name
+        )
+    axis.set(xscale="log", xlabel="training compute, PFLOP", ylabel="PSNR on validation clips, dB")
+    axis.grid(alpha=0.3)
+    axis.legend()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=150, format="png")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
