@@ -12,10 +12,11 @@ there is nothing to restore and the frames pass as they are.
 **A frame by itself** does not dance. If a network of uncertainty maps is there, it says what change to expect; where it
 expects less than 1.5 levels of 255 (but for one pixel in 200), the frame passes as it is.
 
-**Nothing has changed.** A still background is restored once. Where the means over blocks of 16 x 16 pixels are, all through
-a window, what they were when the block was last restored, as far as they fluctuate, what was restored then stands for the
-whole window. The network sees rectangles around the other blocks, with 32 pixels around them, over which the new fades
-into the old.
+**Nothing has changed.** A still background is restored in two windows, and their mean, which dances less than either, stands
+for all that follow. A block of 16 x 16 pixels shows it where its means are, all through a window, what they were when it was
+first restored, as far as they fluctuate; what passes before it does not wipe it out, what comes to stay does. The network
+sees rectangles around the blocks that do not show it or have not been restored often enough, with 32 pixels around them;
+what changes fades into the background over 16.
 """
 
 from collections.abc import Callable
@@ -23,15 +24,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from turbnet.deploy.tiling import raised_cosine
-
 STILL = 0.1
 """RMS displacement, pixels, below which air does not matter."""
+
+ENOUGH = 2
+"""Windows of which a still background is the mean."""
 
 _LOOKED_AT = 12  # frames of a window, equally spaced, that tell the dance
 _BLOCK = 16
 _AROUND = 32  # pixels of context around what has changed
 _CHANGE = 0.012  # of a block's mean, full scale 1: three steps of eight bits
+_SLOPES = 2.0  # how much steeper a picture is than its mean over time
 _FLUCTUATION = 4.0  # standard errors
 _QUIET = 0.75 / 255  # RMS: the last bit of eight
 _EXPECTED, _RARE = 1.5 / 255, 0.995
@@ -54,12 +57,17 @@ class Skipped:
 
 @dataclass(frozen=True)
 class _Kept:
-    """What was restored, by block: its mean and fluctuation then, and whether it stood still; the picture (C, H, W)."""
+    """What was restored, by block: its mean and fluctuation then, whether it stood still, in how many windows; the picture.
+
+    And the least dance of all windows, pixels: what passes by adds to it.
+    """
 
     means: np.ndarray
     spread: np.ndarray
     steady: np.ndarray
-    picture: np.ndarray
+    windows: np.ndarray
+    picture: np.ndarray  # (C, H, W)
+    dance: float
 
 
 class Skipping:
@@ -102,33 +110,48 @@ class Skipping:
             self._kept[turn] = None
             self.skipped.clean += 1
             return frames_BTCHW
-        means, spread = _blocks(grey)
-        # Only what stands still all the time stands for what comes; air moves no edge further than it dances.
-        calm = spread < _CHANGE + moved / _BLOCK
-        now = means.mean(0), spread, calm & _same(means.mean(0), np.inf, spread, means)
         kept, sides = self._kept[turn], frames.shape[2:]
-        known = np.zeros_like(calm)
+        moved = min(moved, kept.dance) if kept else moved
+        means, spread = _blocks(grey)
+        # Only what stands still all the time stands for what comes; air moves the slopes of a picture as far as it dances.
+        slopes = _block_means(np.hypot(*np.gradient(grey.mean(0)))[None])[0]
+        calm = spread < _CHANGE + _SLOPES * moved * np.minimum(slopes, 1 / _BLOCK)
+        steady = calm & _same(means.mean(0), np.inf, spread, means)
+        known, windows = np.zeros_like(calm), np.zeros(calm.shape)
+        boxes = [(slice(0, sides[0]), slice(0, sides[1]))]
         if kept is not None:
             known = calm & kept.steady & _same(kept.means, len(means), np.minimum(kept.spread, spread), means)
-        boxes = _around(~known, sides, self._multiple)
-        area = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
-        share = area / (sides[0] * sides[1])
-        if kept is None or share >= 1:
-            self.skipped.restored += 1
-            restored = self._network(frames_BTCHW)
-            self._kept[turn] = _Kept(*now, restored.mean(1)[0])
-            return restored
+            windows = np.where(known, kept.windows, 0)
+            boxes = _around(windows < ENOUGH, sides, self._multiple)
+        share = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
+        share = min(share / (sides[0] * sides[1]), 1.0)
         self.skipped.restored += share
         self.skipped.still += 1 - share
-        out = np.repeat(kept.picture[None, None], len(frames), axis=1)
-        for box in boxes:
-            fresh = self._network(np.ascontiguousarray(frames_BTCHW[..., *box]))
-            weight = np.outer(*(_fade(part, side) for part, side in zip(box, sides, strict=True))).astype(np.float32)
-            out[..., *box] += weight * (fresh - out[..., *box])
-        if boxes:
-            before = kept.means, kept.spread, kept.steady
-            means, spread, steady = (np.where(known, old, new) for old, new in zip(before, now, strict=True))
-            self._kept[turn] = _Kept(means, spread, steady, out.mean(1)[0])
+        if kept is None or share == 1:
+            fresh = self._network(frames_BTCHW)
+        else:
+            fresh = np.repeat(kept.picture[None, None], len(frames), axis=1)
+            for box in boxes:
+                fresh[..., *box] = self._network(np.ascontiguousarray(frames_BTCHW[..., *box]))
+        if kept is None:
+            self._kept[turn] = _Kept(means.mean(0), spread, steady, windows + 1, fresh.mean(1)[0], moved)
+            return fresh
+        # What passes by does not wipe out the background that it hides; what has come to stay does.
+        passing = ~known & ~steady & kept.steady
+        fresh_blocks = ~known & ~passing
+        gains = np.where(known & (windows < ENOUGH), 1 / (windows + 1), 0)
+        counts = np.maximum(_at_pixels(_grown(fresh_blocks) & ~passing, sides), _at_pixels(gains, sides))
+        picture = kept.picture + counts * (fresh.mean(1)[0] - kept.picture)
+        self._kept[turn] = _Kept(
+            np.where(fresh_blocks, means.mean(0), kept.means),
+            np.where(fresh_blocks, spread, kept.spread),
+            np.where(fresh_blocks, steady, kept.steady),
+            np.where(passing, kept.windows, np.minimum(windows + 1, ENOUGH)),
+            picture,
+            moved,
+        )
+        changes = _at_pixels(_grown(~known), sides)
+        out: np.ndarray = picture + changes * (fresh - picture)
         return out
 
 
@@ -161,14 +184,26 @@ def _multiple(first: int, end: int, side: int, multiple: int) -> slice:
     return slice(first, first + length)
 
 
-def _fade(part: slice, side: int) -> np.ndarray:
-    """Weights of what is new along one axis: it fades in over half of what surrounds it, but for the tile's own border."""
-    weights, ramp = np.ones(part.stop - part.start), raised_cosine(_AROUND // 2)
-    if part.start > 0:
-        weights[: len(ramp)] = ramp
-    if part.stop < side:
-        weights[-len(ramp) :] = ramp[::-1]
-    return weights
+def _grown(blocks_hw: np.ndarray) -> np.ndarray:
+    """True blocks and their neighbours."""
+    height, width = blocks_hw.shape
+    padded = np.pad(blocks_hw, 1)
+    return np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
+
+
+def _at_pixels(blocks_hw: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
+    """Values of blocks at pixels (H, W), float32: the mean of what lies within 8 pixels, so that no border shows."""
+    values = blocks_hw.astype(np.float64)
+    for axis, side in enumerate(sides):
+        starts = _starts(side)
+        values = np.repeat(values, np.diff([*starts, side]), axis=axis)
+        reach = _BLOCK // 2
+        padding = [(0, 0), (0, 0)]
+        padding[axis] = (reach + 1, reach)
+        sums = np.pad(values, padding, mode="edge").cumsum(axis)
+        ahead = np.arange(side)
+        values = (sums.take(ahead + 2 * reach + 1, axis) - sums.take(ahead, axis)) / (2 * reach + 1)
+    return values.astype(np.float32)
 
 
 def dance(frames_THW: np.ndarray) -> float:
@@ -205,14 +240,17 @@ def _blocks(frames_THW: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     The standard deviation, from the median difference of successive frames: what comes and goes makes a few of them large.
     """
-    sums, count = frames_THW.astype(np.float64), np.ones(())
-    for axis in (1, 2):
-        starts = _starts(frames_THW.shape[axis])
-        sums = np.add.reduceat(sums, starts, axis=axis)
-        lengths = np.diff([*starts, frames_THW.shape[axis]])
-        count = np.multiply.outer(count, lengths)
-    means = sums / count
+    means = _block_means(frames_THW)
     return means, np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.954
+
+
+def _block_means(pictures_NHW: np.ndarray) -> np.ndarray:
+    sums, count = pictures_NHW.astype(np.float64), np.ones(())
+    for axis in (1, 2):
+        starts = _starts(pictures_NHW.shape[axis])
+        sums = np.add.reduceat(sums, starts, axis=axis)
+        count = np.multiply.outer(count, np.diff([*starts, pictures_NHW.shape[axis]]))
+    return sums / count
 
 
 def _same(expected_hw: np.ndarray, behind: float, spread_hw: np.ndarray, means_Thw: np.ndarray) -> np.ndarray:
