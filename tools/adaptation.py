@@ -65,6 +65,7 @@ def main() -> int:
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={trained}", *old]
+        more += ["data.clip_frames=4", "task.learning_rate=1e-3", "task.agree_weight=3"]
         tuned = train(options, f"tuned-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         print({name: round(value, 4) for name, value in rows[f"fine-tuned, seed {seed}"].items()}, flush=True)

@@ -140,7 +140,9 @@ class Skipping:
         passing = ~known & ~steady & kept.steady
         fresh_blocks = ~known & ~passing
         gains = np.where(known & (windows < ENOUGH), 1 / (windows + 1), 0)
-        counts = np.maximum(_at_pixels(_grown(fresh_blocks) & ~passing, sides), _at_pixels(gains, sides))
+        counts = np.maximum(
+            _at_pixels((fresh_blocks | _neighbours(fresh_blocks)) & ~passing, sides), _at_pixels(gains, sides)
+        )
         picture = kept.picture + counts * (fresh.mean(1)[0] - kept.picture)
         self._kept[turn] = _Kept(
             np.where(fresh_blocks, means.mean(0), kept.means),
@@ -150,7 +152,7 @@ class Skipping:
             picture,
             moved,
         )
-        changes = _at_pixels(_grown(~known), sides)
+        changes = _at_pixels(~known | _neighbours(~known), sides)
         out: np.ndarray = picture + changes * (fresh - picture)
         return out
 
@@ -182,13 +184,6 @@ def _multiple(first: int, end: int, side: int, multiple: int) -> slice:
     length = min(max(-(-(end - first) // multiple), 4) * multiple, side)
     first = min(first, side - length)
     return slice(first, first + length)
-
-
-def _grown(blocks_hw: np.ndarray) -> np.ndarray:
-    """True blocks and their neighbours."""
-    height, width = blocks_hw.shape
-    padded = np.pad(blocks_hw, 1)
-    return np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
 
 
 def _at_pixels(blocks_hw: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
@@ -256,14 +251,27 @@ def _block_means(pictures_NHW: np.ndarray) -> np.ndarray:
 def _same(expected_hw: np.ndarray, behind: float, spread_hw: np.ndarray, means_Thw: np.ndarray) -> np.ndarray:
     """Where a window, each third of it and every four frames show what is expected, so that nothing passes through: (h, w).
 
+    Of so many comparisons some fail by chance: a block that departs by less than twice what is allowed must have a neighbour
+    that departs as well.
+
     Args:
         behind: frames that what is expected was the mean of; infinite where it is the mean of these frames themselves.
     """
-    same = np.ones(expected_hw.shape, bool)
+    departure = np.zeros(expected_hw.shape)
     count = len(means_Thw)
     for part in (
         part for pieces in {1, min(3, count), max(count // 4, 1)} for part in np.array_split(means_Thw, pieces)
     ):
         allowed = _CHANGE + _FLUCTUATION * spread_hw * np.sqrt(1 / len(part) + 1 / behind)
-        same &= np.abs(part.mean(0) - expected_hw) <= allowed
-    return same
+        departure = np.maximum(departure, np.abs(part.mean(0) - expected_hw) / allowed)
+    departs = departure > 1
+    return ~(departs & (_neighbours(departs) | (departure > 2)))
+
+
+def _neighbours(blocks_hw: np.ndarray) -> np.ndarray:
+    """Where one of the eight blocks around is true."""
+    height, width = blocks_hw.shape
+    padded = np.pad(blocks_hw, 1)
+    places = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    found: np.ndarray = np.any([padded[i : i + height, j : j + width] for i, j in places], axis=0)
+    return found
