@@ -44,9 +44,9 @@ def main() -> int:
         folder = train(name, int(steps), options)
         cost = 3 * step_flops(folder, options.frames)
         curves[name] = [(step, step * cost, quality) for step, quality in history(folder)]
-    lines = ["| network | steps | PFLOP | PSNR, dB |", "|---|---|---|---|"]
+    lines = ["| network | steps | TFLOP | PSNR, dB |", "|---|---|---|---|"]
     for name, curve in curves.items():
-        lines += [f"| {name} | {step} | {flops / 1e15:.2f} | {quality:.2f} |" for step, flops, quality in curve]
+        lines += [f"| {name} | {step} | {flops / 1e12:.1f} | {quality:.2f} |" for step, flops, quality in curve]
     print("\n".join(lines))
     with atomic_path(options.output / "scaling.json") as temporary:
         temporary.write_text(json.dumps(curves, indent=2) + "\n")
@@ -105,9 +105,9 @@ def draw(curves: dict[str, list[tuple[int, float, float]]], path: Path) -> None:
     figure, axis = plt.subplots(figsize=(5.5, 3.6), layout="constrained")
     for (name, curve), marker in zip(curves.items(), "os^vD", strict=False):
         axis.plot(
-            [flops / 1e15 for _, flops, _ in curve], [quality for *_, quality in curve], marker=marker, label=name
+            [flops / 1e12 for _, flops, _ in curve], [quality for *_, quality in curve], marker=marker, label=name
         )
-    axis.set(xscale="log", xlabel="training compute, PFLOP", ylabel="PSNR on validation clips, dB")
+    axis.set(xscale="log", xlabel="training compute, TFLOP", ylabel="PSNR on validation clips, dB")
     axis.grid(alpha=0.3)
     axis.legend()
     with atomic_path(path) as temporary:
