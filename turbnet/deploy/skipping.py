@@ -33,9 +33,9 @@ ENOUGH = 2
 _LOOKED_AT = 12  # frames of a window, equally spaced, that tell the dance
 _BLOCK = 16
 _AROUND = 32  # pixels of context around what has changed
-_CHANGE = 0.012  # of a block's mean, full scale 1: three steps of eight bits
+_CHANGE = 0.010  # of a block's mean, full scale 1
 _SLOPES = 2.0  # how much steeper a picture is than its mean over time
-_FLUCTUATION = 4.0  # standard errors
+_FLUCTUATION = 3.5  # standard errors
 _QUIET = 0.75 / 255  # RMS: the last bit of eight
 _EXPECTED, _RARE = 1.5 / 255, 0.995
 
