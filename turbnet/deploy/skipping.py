@@ -124,7 +124,7 @@ class Skipping:
             windows = np.where(known, kept.windows, 0)
             boxes = _around(windows < ENOUGH, sides, self._multiple)
         share = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
-        share = min(share / (sides[0] * sides[1]), 1.0)
+        share = float(min(share / (sides[0] * sides[1]), 1.0))
         self.skipped.restored += share
         self.skipped.still += 1 - share
         if kept is None or share == 1:
@@ -138,16 +138,14 @@ class Skipping:
             return fresh
         # What passes by does not wipe out the background that it hides; what has come to stay does.
         passing = ~known & ~steady & kept.steady
-        fresh_blocks = ~known & ~passing
+        replaced = ~known & ~passing
         gains = np.where(known & (windows < ENOUGH), 1 / (windows + 1), 0)
-        counts = np.maximum(
-            _at_pixels((fresh_blocks | _neighbours(fresh_blocks)) & ~passing, sides), _at_pixels(gains, sides)
-        )
+        counts = np.maximum(_at_pixels((replaced | _neighbours(replaced)) & ~passing, sides), _at_pixels(gains, sides))
         picture = kept.picture + counts * (fresh.mean(1)[0] - kept.picture)
         self._kept[turn] = _Kept(
-            np.where(fresh_blocks, means.mean(0), kept.means),
-            np.where(fresh_blocks, spread, kept.spread),
-            np.where(fresh_blocks, steady, kept.steady),
+            np.where(replaced, means.mean(0), kept.means),
+            np.where(replaced, spread, kept.spread),
+            np.where(replaced, steady, kept.steady),
             np.where(passing, kept.windows, np.minimum(windows + 1, ENOUGH)),
             picture,
             moved,
