@@ -11,13 +11,13 @@ with clips of its own: there is no truth, so the re-degradation error and the re
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
+from resumable import train
 from torch import Tensor
 
 from turbnet.bench.suite import SIZE, make_clip
@@ -57,16 +57,16 @@ def main() -> int:
     torch.set_num_threads(options.threads)
 
     old = [f"simulator.{name}={value}" for name, value in OLD.items()]
-    trained = train(options, "trained", options.epochs, ["task=redegradation", "data.frames=4", *old])
+    first = trained(options, "trained", options.epochs, ["task=redegradation", "data.frames=4", *old])
     unlabelled = options.real or [simulate(options)]
-    before = load(trained)
+    before = load(first)
     clips = {name: list(scenes(where)) for name, where in (("old", OLD), ("new", NEW))}
     rows = {"trained": measure(before, clips, options.real)}
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
-        more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={trained}", *old]
+        more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
         more += ["data.clip_frames=4", "task.learning_rate=1e-3", "task.agree_weight=3"]
-        tuned = train(options, f"tuned-{seed}", options.tuning, [*more, f"seed={seed}"])
+        tuned = trained(options, f"tuned-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         print({name: round(value, 4) for name, value in rows[f"fine-tuned, seed {seed}"].items()}, flush=True)
     lines = ["| network | " + " | ".join(rows["trained"]) + " |", "|---" * (1 + len(rows["trained"])) + "|"]
@@ -78,26 +78,11 @@ def main() -> int:
     return 0
 
 
-def train(options: argparse.Namespace, name: str, epochs: int, arguments: list[str]) -> Path:
-    """Train, or go on, or leave what is finished; the last checkpoint."""
-    output = options.output / name
-    last: Path = (output / "checkpoints/last.ckpt").resolve()
-    if last.is_file() and read_checkpoint(last)["epoch"] + 1 >= epochs:
-        return last
-    pictures = ",".join(str(path.resolve()) for path in options.pictures)
-    common = [
-        f"data.folders=[{pictures}]",
-        "net=redegrading",
-        "data.size=96",
-        "data.steps_per_epoch=50",
-        "data.moving=0",
-    ]
-    common += [f"output={output}", f"threads={options.threads}", "callbacks=quiet", f"trainer.max_epochs={epochs}"]
-    resume = [f"resume={last}"] if last.is_file() else []
-    subprocess.run(
-        [sys.executable, "-m", "turbnet", "train", *common, *arguments, *options.overrides, *resume], check=True
-    )
-    return last
+def trained(options: argparse.Namespace, name: str, epochs: int, arguments: list[str]) -> Path:
+    """The last checkpoint of one training."""
+    common = ["net=redegrading", "data.size=96", "data.steps_per_epoch=50", "data.moving=0"]
+    arguments = [*common, *arguments, *options.overrides]
+    return train(options.output / name, epochs, options.pictures, options.threads, arguments)
 
 
 def simulate(options: argparse.Namespace) -> Path:

@@ -11,18 +11,17 @@ import argparse
 import csv
 import json
 import math
-import subprocess
 import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
 from omegaconf import OmegaConf
+from resumable import train
 from torch.utils.flop_counter import FlopCounterMode
 
 from turbnet.media.atomic import atomic_path
 from turbnet.nets import build
-from turbnet.tasks.checkpoint import read_checkpoint
 
 SIZE, BATCH, EPOCH = 128, 3, 20
 
@@ -41,7 +40,7 @@ def main() -> int:
     options = parser.parse_args()
     curves = {}
     for name, steps in (entry.split("=") for entry in options.steps):
-        folder = train(name, int(steps), options)
+        folder = trained(name, int(steps), options)
         cost = 3 * step_flops(folder, options.frames)
         curves[name] = [(step, step * cost, quality) for step, quality in history(folder)]
     lines = ["| network | steps | TFLOP | PSNR, dB |", "|---|---|---|---|"]
@@ -54,26 +53,15 @@ def main() -> int:
     return 0
 
 
-def train(name: str, steps: int, options: argparse.Namespace) -> Path:
-    """Train one network, or go on, or leave what is finished; its folder."""
+def trained(name: str, steps: int, options: argparse.Namespace) -> Path:
+    """The folder of one network's training."""
     folder: Path = options.output / name
-    last = folder / "checkpoints/last.ckpt"
     epochs = math.ceil(steps / EPOCH)
-    if last.is_file() and read_checkpoint(last)["epoch"] + 1 >= epochs:
-        return folder
-    pictures = ",".join(str(path.resolve()) for path in options.pictures)
-    arguments = [
-        f"experiment={name}",
-        "data=folders",
-        f"data.folders=[{pictures}]",
-        f"data.frames=[1,{options.frames}]",
-    ]
-    arguments += [f"data.size={SIZE}", f"data.batch_size={BATCH}", f"data.steps_per_epoch={EPOCH}", "data.val_clips=6"]
-    arguments += [f"data.curriculum={steps // 4}", "data.text=0.25", "data.moving=0.25", "callbacks=quiet"]
-    arguments += [f"trainer.max_epochs={epochs}", f"trainer.check_val_every_n_epoch={math.gcd(epochs, 2)}"]
-    arguments += [f"output={folder.resolve()}", f"threads={options.threads}", *options.overrides]
-    arguments += [f"resume={last.resolve()}"] if last.is_file() else []
-    subprocess.run([sys.executable, "-m", "turbnet", "train", *arguments], check=True)
+    arguments = [f"experiment={name}", "data=folders", f"data.frames=[1,{options.frames}]", "data.val_clips=6"]
+    arguments += [f"data.size={SIZE}", f"data.batch_size={BATCH}", f"data.steps_per_epoch={EPOCH}"]
+    arguments += [f"data.curriculum={steps // 4}", "data.text=0.25", "data.moving=0.25"]
+    arguments += [f"trainer.check_val_every_n_epoch={math.gcd(epochs, 2)}", *options.overrides]
+    train(folder, epochs, options.pictures, options.threads, arguments)
     return folder
 
 
