@@ -11,7 +11,12 @@ from turbnet.cli import run
 from turbnet.deploy.session import Model
 from turbnet.nets import build
 
-NET = {"name": "restorer", "tilt": {"widths": [8, 8, 8]}, "tcja": {"width": 8, "depth": 1}}
+NET = {
+    "name": "restorer",
+    "tilt": {"widths": [8, 8, 8]},
+    "tcja": {"width": 8, "depth": 1},
+    "scene": {"widths": [8, 8, 8], "depths": [1, 1, 1]},
+}
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +26,7 @@ def checkpoint() -> dict:
     for parameter in network.parameters():  # heads start at zero; as if trained
         nn.init.normal_(parameter, std=0.05)
     weights = {f"net.{name}": weight for name, weight in network.state_dict().items()}
-    recipe = {"frames": 6, "steps": 100, "data": "/home/someone/photos"}
+    recipe = {"frames": [1, 14], "steps": 100, "data": "/home/someone/photos"}
     return {
         "state_dict": weights | {"pairs.scale": torch.ones(1)},
         "hyper_parameters": {"net": NET, "simulator": {"d_over_r0": [1.0, 4.0]}, "seed": 7, "recipe": recipe},
@@ -40,8 +45,8 @@ def test_checkpoint_to_model(checkpoint, tmp_path, capsys):
     model = Model.load(tmp_path / "last.onnx")
     card = model.card
     assert {"name": card.architecture, **card.config} == NET
-    assert (card.size_multiple, card.frames, card.seed) == (8, 6, 7)
-    assert card.notes == {"simulator": {"d_over_r0": [1.0, 4.0]}, "frames": 6, "steps": 100, "data": "photos"}
+    assert (card.size_multiple, card.frames, card.seed) == (8, 14, 7)  # of a range of frames the greatest
+    assert card.notes == {"simulator": {"d_over_r0": [1.0, 4.0]}, "frames": [1, 14], "steps": 100, "data": "photos"}
     assert json.loads((tmp_path / "last.json").read_text())["sha256"] == card.sha256
     assert card.sha256 in (tmp_path / "last.md").read_text()
 
@@ -50,24 +55,6 @@ def test_checkpoint_to_model(checkpoint, tmp_path, capsys):
     frames_BTCHW = torch.rand(1, 4, 3, 40, 56)
     with torch.no_grad():
         np.testing.assert_allclose(model(frames_BTCHW.numpy()), network(frames_BTCHW).numpy(), atol=2e-5)
-
-
-def test_a_range_of_frames_gives_its_greatest_and_streaming_goes_frame_by_frame(checkpoint, tmp_path):
-    hyper_parameters = checkpoint["hyper_parameters"]
-    recipe = {**hyper_parameters["recipe"], "frames": [1, 14]}
-    changed = {**checkpoint, "hyper_parameters": {**hyper_parameters, "recipe": recipe}}
-    torch.save(changed, tmp_path / "last.ckpt")
-    assert run(["export", str(tmp_path / "last.ckpt"), "--quiet"]) == 0
-    assert Model.load(tmp_path / "last.onnx").card.frames == 14
-    stream = tmp_path / "stream.onnx"
-    options = ["--streaming", "--horizon", "9", "--remember", "2", "--quiet"]
-    assert run(["export", str(tmp_path / "last.ckpt"), "-o", str(stream), *options]) == 0
-    model = Model.load(stream)
-    assert model.card.carried["memory"]["shape"][0] == 2
-    assert model.card.notes["frame by frame"] == "horizon 9 frames, keys and values of 2"
-    frames_BTCHW = np.random.default_rng(0).random((1, 3, 3, 32, 32), np.float32)
-    first = Model.load(tmp_path / "last.onnx")(frames_BTCHW[:, :1])
-    np.testing.assert_allclose(model(frames_BTCHW)[:, :1], first, atol=2e-5)  # nothing seen before
 
 
 def test_streaming_options_out_of_range(checkpoint, tmp_path, capsys):

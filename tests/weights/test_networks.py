@@ -39,10 +39,13 @@ def test_the_card_says_what_a_user_must_know(name):
 
 
 def test_export_by_name_goes_frame_by_frame(tmp_path, capsys):
-    assert run(["export", NAMES[-1], "-o", str(tmp_path / "stream.onnx"), "--streaming", "--remember", "2"]) == 0
+    options = ["--streaming", "--horizon", "9", "--remember", "2"]
+    assert run(["export", NAMES[-1], "-o", str(tmp_path / "stream.onnx"), *options]) == 0
     model, whole = Model.load(tmp_path / "stream.onnx"), Model.load(released_models()[NAMES[-1]])
+    assert model.card.carried["memory"]["shape"][0] == 2
+    assert model.card.notes["frame by frame"] == "horizon 9 frames, keys and values of 2"
     clip = np.random.default_rng(0).random((1, 2, 3, 40, 48), np.float32)
-    np.testing.assert_allclose(model(clip)[:, :1], whole(clip[:, :1]), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(model(clip)[:, :1], whole(clip[:, :1]), rtol=0, atol=1e-4)  # nothing seen before
 
 
 def test_a_name_that_is_none():

@@ -151,7 +151,8 @@ def dance(sums_B4hw: Tensor) -> Tensor:
 def _recent(neighbours_BTCHW: Tensor, past: Past | None) -> Tensor:
     """What is carried on as `Past.recent`: the mean around the last frame."""
     latest = neighbours_BTCHW[:, -1]
-    number = torch.full_like(latest[:, :1], float(neighbours_BTCHW.shape[1]))
+    # Not the shape's number: the exporter would take it for a constant, and trace everything once more to free it.
+    number = torch.ones_like(neighbours_BTCHW[:, :, :1]).sum(1)
     if past is not None:
         number = number + past.recent[:, -1:]
     return torch.cat((latest, number.clamp(max=float(RECENT - 1))), dim=1)
