@@ -62,6 +62,30 @@ def test_the_tilt_map_takes_the_frames_to_the_blur_only_frames(scene):
     assert not torch.allclose(pair.blur_only, pair.target, atol=0.01)  # it is blurred
 
 
+def test_settled_is_what_registered_frames_show_on_average(scene):
+    """In the clip's mean geometry true tilts have no mean, and bring the frames to the truth, which elsewhere they miss."""
+    pair = PairMaker(64, 64, d_over_r0=(3.0, 3.0), independent=1.0, **SMALL, **SILENT)(scene, [4])
+    settled, inner = pair.settled(), (..., slice(12, -12), slice(12, -12))
+    assert torch.equal(settled.frames, pair.frames)
+    assert pair.tilt.mean(1)[inner].abs().max() > 0.5  # four frames
+    assert settled.tilt.mean(1)[inner].abs().max() < 1e-3
+
+    def distance(truth, tilt):
+        registered = sample(to_linear(pair.frames).flatten(0, 1), tilt.flatten(0, 1)).view_as(truth)
+        return float((registered - to_linear(truth))[inner].square().mean())
+
+    there = distance(settled.blur_only, settled.tilt)
+    assert there < 0.2 * distance(pair.blur_only, settled.tilt)
+    assert there < 2 * distance(pair.blur_only, pair.tilt)  # as well as in the scene's own geometry
+
+
+def test_settled_without_air_is_the_scene(scene):
+    pair = PairMaker(64, 64, d_over_r0=(0.0, 0.0), **SMALL, **SILENT)(scene, [0])
+    settled = pair.settled()
+    torch.testing.assert_close(settled.target, scene, rtol=0, atol=1e-6)
+    assert not settled.tilt.any()
+
+
 @pytest.mark.parametrize("model", ["direct-to-image", "warp-blur"])
 def test_the_simple_models_stand_in_for_the_simulator(scene, model):
     """The same contract: the true tilt takes the frames to the blur-only frames, and the camera points at the mean."""

@@ -165,7 +165,7 @@ def test_two_stages(command):
     code, _, err = command("experiment=tiny_tilt", *SECONDS[1:], "output=one")
     assert code == 0, err
     start = "task.start_from=one/checkpoints/last.ckpt"
-    code, _, err = command(*SECONDS, start, "task.freeze_tilt=true", "output=two")
+    code, _, err = command(*SECONDS, start, "task.freeze=[tilt]", "output=two")
     assert code == 0, err
     before, after = weights(Path("one")), weights(Path("two"))
     assert all(torch.equal(before[name], after[name]) == name.startswith("net.tilt.") for name in before)

@@ -137,7 +137,7 @@ def test_the_seed_decides_the_run(train, tmp_path, stage_one, weights):
 
 def test_second_stage_starts_from_the_first_and_may_freeze_it(train, tmp_path, stage_one, weights):
     start = stage_one / "checkpoints/last.ckpt"
-    second = train(tmp_path, f"task.start_from={start}", "task.freeze_tilt=true", "task.weight_decay=0.1")
+    second = train(tmp_path, f"task.start_from={start}", "task.freeze=[tilt]", "task.weight_decay=0.1")
     before, after = weights(start), weights(second / "checkpoints/last.ckpt")
     for name in before:
         assert torch.equal(before[name], after[name]) == name.startswith("tilt."), name

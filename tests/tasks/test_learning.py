@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from turbnet.errors import InputError, ParameterError
 from turbnet.nets.tilt import SCALES
-from turbnet.tasks.losses import registration_loss
+from turbnet.tasks.losses import charbonnier, frequency_loss, registration_loss
 from turbnet.tasks.restoration import Restoration
 from turbnet.tasks.tilt import TiltRemoval
 
@@ -83,7 +83,7 @@ def test_gradients_are_finite(kind, strength, batch):
     [
         (make(TiltRemoval), {"tilt"}),
         (make(Restoration), {"tilt", "tcja", "fusion", "inverse", "scene", "own"}),
-        (make(Restoration, freeze_tilt=True), {"tcja", "fusion", "inverse", "scene", "own"}),
+        (make(Restoration, freeze=["tilt"]), {"tcja", "fusion", "inverse", "scene", "own"}),
     ],
 )
 def test_what_a_task_learns(task, learns, batch):
@@ -95,13 +95,41 @@ def test_what_a_task_learns(task, learns, batch):
 
 
 def test_frozen_tilts_have_no_weight_in_the_loss(batch):
-    from turbnet.tasks.losses import charbonnier, frequency_loss
-
-    task = make(Restoration, freeze_tilt=True, own_weight=0.0, gate_weight=0.0)
-    pair = task.pair(batch)
+    task = make(Restoration, freeze=["tilt"], own_weight=0.0, scene_weight=0.0, gate_weight=0.0)
+    pair = task.pair(batch).settled()
     restored = task.net(pair.frames)
     expected = charbonnier(restored, pair.target) + 0.1 * frequency_loss(restored, pair.target)
     assert task.training_step(batch, 0) == expected
+
+
+def test_a_scene_that_the_gate_shuts_out_goes_on_learning(batch, learn):
+    task = make(Restoration, gate_weight=0.0)
+    with torch.no_grad():
+        task.net.own.head.bias[-4:] = 40.0  # the gate, for each of 2 x 2 pixels: all frames are themselves
+    pair = task.pair(batch).settled()
+
+    def off():
+        with torch.no_grad():
+            stages = task.net.stages(pair.frames)
+        torch.testing.assert_close(stages.frames, stages.own, rtol=0, atol=1e-6)
+        return charbonnier(stages.scene, pair.target)
+
+    before = off()
+    learn(task, batch, 60, 2e-3)
+    assert off() < 0.9 * before
+
+
+@torch.no_grad()
+def test_from_how_many_frames_a_clip_is_restored_in_its_mean_geometry(batch):
+    scored = {}
+    frames = batch["scene"].shape[1]
+    for settled in (frames, frames + 1):
+        weights = dict.fromkeys(("frequency_weight", "own_weight", "scene_weight", "gate_weight"), 0.0)
+        task = make(Restoration, settled=settled, freeze=["tilt"], moving_weight=1.0, **weights)
+        scored[settled] = task.training_step(batch, 0)
+    pair, restored = task.pair(batch), task.net(task.pair(batch).frames)
+    assert scored[frames] == charbonnier(restored, pair.settled().target)
+    assert scored[frames + 1] == charbonnier(restored, pair.target)
 
 
 @pytest.mark.parametrize("kind", [TiltRemoval, Restoration])
@@ -125,6 +153,16 @@ def test_validation_scores_the_input_too(kind, batch):
 def test_out_of_range(more, says):
     with pytest.raises(ParameterError, match=says):
         make(TiltRemoval, **more)
+
+
+def test_freezing_what_is_no_part():
+    with pytest.raises(InputError, match="no part 'tails', but tilt, tcja, fusion, inverse, scene, own"):
+        make(Restoration, freeze=["tails"])
+
+
+def test_settled_from_no_frames():
+    with pytest.raises(ParameterError, match="settled"):
+        make(Restoration, settled=0)
 
 
 def test_clips_that_the_network_cannot_take():

@@ -15,6 +15,7 @@ from turbnet.media.colour import to_linear, to_srgb
 from turbnet.simulate.ranges import Conditions, Ranges
 from turbnet.simulate.simple import DirectToImage, WarpBlur
 from turbnet.simulate.simulator import Simulator
+from turbnet.simulate.tilt import displacement, sample
 
 SIMPLE = {"direct-to-image": DirectToImage, "warp-blur": WarpBlur}
 """Simple models of turbulence that can stand in for the exact simulator."""
@@ -35,6 +36,26 @@ class Pair:
     target: Tensor
     blur_only: Tensor
     tilt: Tensor
+
+    def settled(self) -> "Pair":
+        r"""The same frames, and the truth in the mean geometry of each clip.
+
+        A clip shows the scene point u at :math:`u + \bar t(u)` on average, and nobody can know :math:`\bar t`. A network
+        that is compared with the scene at u learns to blur by what it cannot know; compared with
+
+        .. math::
+            S'(u + \bar t(u)) = S(u), \qquad t'(u + \bar t(u)) = t(u) - \bar t(u)
+
+        it does not.
+        """
+        mean = self.tilt.mean(1, keepdim=True)
+        back = -displacement(mean[:, 0], 1)[:, None].expand_as(self.tilt).flatten(0, 1)
+
+        def moved(clip_BTCHW: Tensor) -> Tensor:
+            return sample(clip_BTCHW.flatten(0, 1), back).unflatten(0, clip_BTCHW.shape[:2])
+
+        target, blur_only = (moved(clip).clamp(0, 1) for clip in (self.target, self.blur_only))
+        return Pair(self.frames, target, blur_only, moved(self.tilt - mean))
 
 
 class PairMaker(nn.Module):

@@ -47,7 +47,11 @@ class Redegradation(SimulatedTask):
             )
 
     def supervised(self, pair: Pair) -> tuple[Tensor, dict[str, Tensor], Redegraded]:
-        """Loss of a pair, what it is made of, what the network found."""
+        """Loss of a pair, what it is made of, what the network found.
+
+        Codes tell the tilt from a clip's mean geometry, so that is where clips are compared.
+        """
+        pair = pair.settled() if pair.frames.shape[1] > 1 else pair  # of a frame alone no tilt is seen
         net, weight = self.net, self.hparams["redegradation_weight"]
         registered = net.code.tilt(pair.frames)
         restored, code = net.restorer(pair.frames), net.code(pair.frames, registered)

@@ -1,11 +1,12 @@
 """Stage two, or both at once: tilt removal and restoration end to end."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from torch import Tensor, nn
 
 from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.errors import InputError, check_range
 from turbnet.nets.dncnn import DnCNN
 from turbnet.nets.restorer import Restorer
 from turbnet.nets.still import StillRestorer
@@ -29,11 +30,14 @@ class Restoration(SimulatedTask):
     """Trains a restorer: its frames are compared with the clean clip, its registration, if it has any, as in `TiltRemoval`.
 
     Args:
-        tilt_weight, registration_weight, frequency_weight, own_weight, gate_weight: of the tilt, registration and frequency
-            losses, of the distance of the frames restored by themselves, of the gate's loss.
+        tilt_weight, registration_weight, frequency_weight, own_weight, scene_weight, gate_weight: of the tilt, registration
+            and frequency losses, of the distance of the frames restored by themselves and of the scene where it is still, of
+            the gate's loss. Without losses of their own the one that is behind is shut out by the gate and learns no more.
         moving_weight: of pixels that move of themselves, against those that do not: they are few.
         map_weight: of the likelihood of uncertainty maps, where the network has them.
-        freeze_tilt: keep the tilt net as it is; then its losses have no weight.
+        settled: clips of this many frames or more are restored in their mean geometry (`turbnet.data.pairs.Pair.settled`),
+            where tilts are compared anyway. From fewer a picture scores more that is blurred by what cannot be known.
+        freeze: names of parts of the network that stay as they are, such as [tilt]; then its losses have no weight.
         start_from: checkpoint whose network to start from, such as one of `TiltRemoval`.
         more: see `SimulatedTask`.
     """
@@ -46,10 +50,12 @@ class Restoration(SimulatedTask):
         registration_weight: float = 0.2,
         frequency_weight: float = 0.1,
         own_weight: float = 0.4,
+        scene_weight: float = 0.6,
         gate_weight: float = 0.1,
         moving_weight: float = 6.0,
         map_weight: float = 0.01,
-        freeze_tilt: bool = False,
+        settled: int = 4,
+        freeze: Sequence[str] = (),
         start_from: str | None = None,
         **more: Any,
     ) -> None:
@@ -58,18 +64,24 @@ class Restoration(SimulatedTask):
             registration_weight=registration_weight,
             frequency_weight=frequency_weight,
             own_weight=own_weight,
+            scene_weight=scene_weight,
             gate_weight=gate_weight,
             moving_weight=moving_weight,
             map_weight=map_weight,
-            freeze_tilt=freeze_tilt,
+            settled=int(check_range("settled", settled, 1, 10_000, "frames")),
+            freeze=list(freeze),
             **more,
         )
         if start_from is not None:
             self.net.load_state_dict(load_net(start_from, expect=self.hparams["net"]))
 
     def trained(self) -> Iterable[nn.Parameter]:
-        """The network, or all of it but the tilt net."""
-        frozen = set(self.net.tilt.parameters()) if self.hparams["freeze_tilt"] and self._registers else set()
+        """The network, but for the parts that are frozen."""
+        parts = dict(self.net.named_children())
+        for name in self.hparams["freeze"]:
+            if name not in parts:
+                raise InputError(f"freeze: the network has no part {name!r}, but {', '.join(parts)}")
+        frozen = {parameter for name in self.hparams["freeze"] for parameter in parts[name].parameters()}
         return [parameter for parameter in self.net.parameters() if parameter not in frozen]
 
     @property
@@ -78,6 +90,9 @@ class Restoration(SimulatedTask):
 
     def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         pair = self.pair(batch)
+        seen = pair.settled()
+        if pair.frames.shape[1] >= self.hparams["settled"]:
+            pair = seen
         stages = self.net.stages(pair.frames) if self._registers else None
         still = self.net.stages(pair.frames) if isinstance(self.net, StillRestorer) else None
         found = stages or still
@@ -88,14 +103,16 @@ class Restoration(SimulatedTask):
         values = {"charbonnier": distance}
         if stages:
             values["own"] = charbonnier(stages.own, pair.target, weight=counts)
+            values["scene"] = charbonnier(stages.scene, pair.target, weight=moving_weights(pair.target, 0.0))
             values["gate"] = gate_loss(stages, pair.target)
-            loss = loss + self.hparams["own_weight"] * values["own"] + self.hparams["gate_weight"] * values["gate"]
-        if stages and not self.hparams["freeze_tilt"]:
+            for name in ("own", "scene", "gate"):
+                loss = loss + self.hparams[f"{name}_weight"] * values[name]
+        if stages and "tilt" not in self.hparams["freeze"]:
             registered = stages.registered
-            astray = registration_loss(pair.frames, pair.blur_only, registered.tilts)
-            loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
+            astray = registration_loss(seen.frames, seen.blur_only, registered.tilts)
+            loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, seen.tilt)
             loss = loss + self.hparams["registration_weight"] * astray
-            values["tilt_px"] = tilt_error(registered, pair.tilt)
+            values["tilt_px"] = tilt_error(registered, seen.tilt)
         if still and still.uncertainty:
             tilt, blur = pair.blur_only - pair.frames, pair.target - pair.blur_only
             values["maps"] = laplace_loss(still.uncertainty, tilt, blur)

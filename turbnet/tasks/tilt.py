@@ -12,7 +12,7 @@ from turbnet.tasks.simulated import SimulatedTask
 
 class TiltRemoval(SimulatedTask):
     """Trains the tilt net of a restorer: registered frames are compared with the blur-only frames at three scales, the
-    estimated tilts and their confidence with the true tilt map.
+    estimated tilts and their confidence with the true tilt map, all in the clip's mean geometry.
 
     Args:
         tilt_weight: weight of the tilt loss against the registration loss (intensity).
@@ -27,7 +27,7 @@ class TiltRemoval(SimulatedTask):
         return self.net.tilt.parameters()
 
     def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
-        pair = self.pair(batch)
+        pair = self.pair(batch).settled()
         registered = self.net.tilt(pair.frames)
         distance = registration_loss(pair.frames, pair.blur_only, registered.tilts)
         loss = distance + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
