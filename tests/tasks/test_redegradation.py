@@ -13,6 +13,7 @@ from turbnet.deploy.checkpoint import load_network
 from turbnet.errors import InputError
 from turbnet.media.clip import write_clip
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.nets.restorer import Restorer
 from turbnet.nets.still import StillRestorer
 from turbnet.tasks.checkpoint import read_checkpoint
 from turbnet.tasks.finetune import Finetuning
@@ -75,11 +76,13 @@ def clips(tmp_path_factory):
     return folder
 
 
-NET = (
-    "net=redegrading",
+STILL = ("net=redegrading", "net.form=linear", "net.restorer.widths=[4,4,4]", "net.restorer.depths=[1,1,1]")
+CLIP = (
+    "net=redegrading_clip",
     "net.form=linear",
-    "net.restorer.widths=[4,4,4]",
-    "net.restorer.depths=[1,1,1]",
+    "net.restorer.tilt.widths=[4,4,4]",
+    "net.restorer.tcja={width: 8, depth: 1}",
+    "net.restorer.scene={widths: [4,4,4], depths: [1,1,1]}",
 )
 
 
@@ -93,27 +96,28 @@ def run(tmp_path_factory):
         small = ["threads=1", "callbacks=quiet", "data.size=32", "data.batch_size=2", "data.steps_per_epoch=2"]
         small += ["data.val_clips=2", "trainer.max_epochs=2", "simulator.modes=10", "simulator.components=3"]
         with initialize_config_module("turbnet.configs", version_base="1.3"):
-            fit(compose("train", overrides=[*small, *NET, f"output={folder}", *overrides]))
+            fit(compose("train", overrides=[*small, f"output={folder}", *overrides]))
         return folder
 
     return go
 
 
-def test_pre_training_then_fine_tuning_as_a_user_does(run, clips):
-    first = run("first", "task=redegradation", "data.frames=3")
+@pytest.mark.parametrize(("net", "name", "kind"), [(STILL, "still", StillRestorer), (CLIP, "restorer", Restorer)])
+def test_pre_training_then_fine_tuning_as_a_user_does(run, clips, net, name, kind):
+    first = run("first", *net, "task=redegradation", "data.frames=3")
     start = first / "checkpoints/last.ckpt"
-    more = ("task=finetune", "data=clips", f"data.clips=[{clips}]", "data.clip_frames=3", "data.frames=3")
+    more = (*net, "task=finetune", "data=clips", f"data.clips=[{clips}]", "data.clip_frames=3", "data.frames=3")
     tuned = run("tuned", *more, f"task.start_from={start}")
     before, after = (read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"] for run in (first, tuned))
     assert before.keys() == after.keys()
-    assert any(not torch.equal(before[name], after[name]) for name in before)
+    assert any(not torch.equal(before[part], after[part]) for part in before)
     assert OmegaConf.load(tuned / "config.yaml").task.rehearsal_weight == 1.0
     restorer, hyper = load_network(tuned / "checkpoints/last.ckpt")
-    assert isinstance(restorer, StillRestorer)  # to run and to export
-    assert hyper["net"]["name"] == "still"
+    assert isinstance(restorer, kind)  # to run and to export
+    assert hyper["net"]["name"] == name
     again = run("again", *more, f"task.start_from={start}")
     same = read_checkpoint(again / "checkpoints/last.ckpt")["state_dict"]
-    assert all(torch.equal(after[name], same[name]) for name in after)
+    assert all(torch.equal(after[part], same[part]) for part in after)
 
 
 def test_a_restorer_alone_can_be_started_from(tmp_path):
@@ -156,7 +160,7 @@ def test_of_a_long_clip_some_frames_are_fused(tmp_path):
 
 
 def test_clips_that_cannot_be_used(run, clips, tmp_path):
-    more = ("task=finetune", "data=clips", "task.start_from=null")
+    more = (*STILL, "task=finetune", "data=clips", "task.start_from=null")
     with pytest.raises(Exception, match="too few"):
         run("long", *more, f"data.clips=[{clips}]", "data.clip_frames=40")
     with pytest.raises(Exception, match="no clips"):
