@@ -90,9 +90,9 @@ class Restoration(SimulatedTask):
 
     def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         pair = self.pair(batch)
-        seen = pair.settled()
-        if pair.frames.shape[1] >= self.hparams["settled"]:
-            pair = seen
+        enough = pair.frames.shape[1] >= self.hparams["settled"]
+        seen = pair.settled() if enough or self._registers else pair
+        pair = seen if enough else pair
         stages = self.net.stages(pair.frames) if self._registers else None
         still = self.net.stages(pair.frames) if isinstance(self.net, StillRestorer) else None
         found = stages or still
