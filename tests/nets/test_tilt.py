@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from turbnet.data.pairs import PairMaker
 from turbnet.nets.blocks import warp
 from turbnet.nets.lucas_kanade import lucas_kanade
-from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, TiltNet, neighbours, weighted_mean
+from turbnet.nets.tilt import ERROR_AT_HALF, SCALES, TiltNet, mean_free, neighbours, weighted_mean
 
 
 def trained(seed: int = 0) -> TiltNet:
@@ -40,6 +40,24 @@ def test_which_way_time_runs_does_not_matter():
 
 
 @torch.no_grad()
+def test_the_tilts_of_a_clip_have_no_mean():
+    out = trained()(torch.rand(2, 5, 3, 24, 32))
+    for tilt, logit in zip(out.tilts, out.logits, strict=True):
+        assert tilt.abs().max() > 0.1
+        torch.testing.assert_close(
+            (torch.sigmoid(logit) * tilt).mean(1), torch.zeros_like(tilt[:, 0]), rtol=0, atol=1e-5
+        )
+
+
+@torch.no_grad()
+def test_what_was_seen_before_keeps_the_geometry_where_it_is():
+    """One frame after nothing is the geometry; after three as sure it moves it by a quarter of its tilt."""
+    tilt, logit = torch.full((1, 1, 2, 4, 4), 2.0), torch.zeros(1, 1, 1, 4, 4)
+    assert not mean_free(tilt, logit, torch.zeros(1, 1, 4, 4)).any()
+    torch.testing.assert_close(mean_free(tilt, logit, torch.full((1, 1, 4, 4), 1.5)), 0.75 * tilt)
+
+
+@torch.no_grad()
 def test_the_drift_is_a_mean_over_five_frames_less_the_reference():
     net, clip = TiltNet(widths=(4, 4, 4)), torch.rand(1, 7, 3, 16, 16)
     out = net(clip)
@@ -70,7 +88,7 @@ def test_channels_of_the_frames():
 
 
 def lucas_kanade_pyramid(frames: torch.Tensor) -> torch.Tensor:
-    """Tilt at half resolution (T, 2, H/2, W/2) by coarse-to-fine Lucas-Kanade steps towards the mean of the frames."""
+    """Tilt at half resolution (T, 2, H/2, W/2) by coarse-to-fine Lucas-Kanade steps to the frames' mean, without mean."""
     tilt = None
     for scale in (8, 4, 2):
         small = F.avg_pool2d(frames, scale)
@@ -81,6 +99,7 @@ def lucas_kanade_pyramid(frames: torch.Tensor) -> torch.Tensor:
         registered = warp(small, tilt / scale)
         step = lucas_kanade(registered, registered.mean(0, keepdim=True), torch.tensor(-7.0).exp())
         tilt = tilt + scale * torch.sigmoid(torch.tensor(3.0)) * step
+        tilt = tilt - tilt.mean(0)
     return tilt
 
 

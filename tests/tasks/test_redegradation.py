@@ -24,9 +24,17 @@ RESTORER = {"name": "still", "widths": [8, 12, 16], "depths": [1, 1, 1]}
 SIMULATOR = {"height": 32, "width": 32, "modes": 10, "components": 3, "read_noise": [0.0, 0.0], "d_over_r0": [3.0, 3.0]}
 
 
-def make(kind, form="linear", **more):
+CLIP_RESTORER = {
+    "name": "restorer",
+    "tilt": {"widths": [4, 4, 4]},
+    "tcja": {"width": 8, "depth": 1},
+    "scene": {"widths": [8, 12, 16], "depths": [1, 1, 1]},
+}
+
+
+def make(kind, form="linear", restorer=RESTORER, **more):
     torch.manual_seed(0)
-    net = {"name": "redegrading", "form": form, "restorer": RESTORER, "code": {"width": 8, "depth": 1}}
+    net = {"name": "redegrading", "form": form, "restorer": restorer, "code": {"width": 8, "depth": 1}}
     if form == "physical":
         net["degradation"] = {"modes": 10, "components": 3}
     task = kind(net=net, simulator=SIMULATOR, **more)
@@ -55,6 +63,22 @@ def test_without_truth_it_learns_to_give_what_was_seen(form, batch, learn):
     for name in ("unsupervised", "agree", "old_charbonnier"):
         assert last[name] < first[name], name
     assert last["prior"] <= first["prior"] + 0.01  # of a linear form it starts at zero
+
+
+@pytest.mark.parametrize("kind", [Redegradation, Finetuning])
+def test_the_still_scene_of_a_restorer_of_clips_has_a_loss_of_its_own(kind, batch):
+    """The gate prefers the frames everywhere: without that loss the scene would not learn."""
+    moves = {}
+    for weight in (0.0, 0.6):
+        task = make(kind, restorer=CLIP_RESTORER, scene_weight=weight)
+        restorer = task.net.restorer
+        with torch.no_grad():
+            restorer.own.head.bias[-4:] = 40.0
+        pair = task.pair(batch)
+        clip = {"scene": pair.frames, "fused": pair.target[:, 0], "seed": batch["seed"], "hardness": batch["hardness"]}
+        task.training_step({"clips": clip, "scenes": batch} if kind is Finetuning else batch, 0).backward()
+        moves[weight] = sum(float(p.grad.abs().max()) for p in restorer.scene.parameters() if p.grad is not None)
+    assert moves[0.0] < 1e-6 < 1e-3 < moves[0.6]
 
 
 def test_values_and_networks_that_do_not_fit(batch):

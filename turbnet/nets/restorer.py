@@ -103,7 +103,8 @@ class Restorer(nn.Module):
         if past is not None:
             earlier = torch.cat((past.pictures[:, :, :-1], past.pictures[:, :, -1:] + _NO_WEIGHT), dim=2)
         pictures, weight = self.fusion(registered.frames, features, confidence, earlier)
-        sharpened = self.inverse(pictures[:, 0])
+        # Of the plain mean: its blur is the mean PSF, which the filters know; that of a lucky picture is not.
+        sharpened = self.inverse(registered.reference[:, 0])
         sums = _sums(registered.tilts[-1], past)
         seen = torch.cat((pictures, sharpened), dim=1).flatten(1, 2)
         scene = self.scene(seen, gathered, hints_BCHW=dance(sums))[:, None]

@@ -7,8 +7,8 @@ First a learned lucky fusion: K pictures, each a mean of the registered frames w
 
 from logits l that the frames' features give and the confidence c of the registration. Then a U-Net on half, a quarter and
 an eighth of the resolution sharpens the first of them, knowing the others, what inverse filters (`turbnet.nets.inverse`)
-make of the first, and what the reference gathered. However many frames a clip has, this part runs once: a deep network at a
-small cost a frame.
+make of the mean of the registered frames, and what the reference gathered. However many frames a clip has, this part runs
+once: a deep network at a small cost a frame.
 """
 
 from collections.abc import Sequence

@@ -12,6 +12,14 @@ The reference is the mean of the frames as registered so far, each weighted by i
 scene weighs little in it, and it sharpens from level to level. Nothing depends on the number of frames, and a reference
 made of earlier frames can take part in it.
 
+Registration to a mean of the frames themselves leaves open where that mean lies, and level by level it would wander. Nobody
+can know the tilt that all frames share, so after every level the mean tilt of the clip, by confidence, is taken out:
+
+.. math::
+    \sum_t c_t(x)\, t_t(x) = 0
+
+and the frames are registered to the mean geometry of the clip, as those seen earlier were to theirs.
+
 What moves of itself and what the air moves look alike in one frame; over a few frames they do not, for the air moves to and
 fro. So a level also sees the drift: the mean of the frames t - 2 .. t + 2, less the reference. It is small where only the
 air moves.
@@ -154,6 +162,9 @@ class TiltNet(nn.Module):
             moved, logit = level(registered, everywhere.flatten(0, 1), tilt / scale, logit, drift.flatten(0, 1))
             tilt = tilt + scale * moved.to(tilt.dtype)
             logit = logit.to(tilt.dtype).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+            tilt, logit = (x.unflatten(0, (batch, count)) for x in (tilt, logit))
+            still = None if past_BCHW is None else F.avg_pool2d(past_BCHW[:, -1:], scale)
+            tilt, logit = mean_free(tilt, logit, still).flatten(0, 1), logit.flatten(0, 1)
             tilts.append(tilt)
             logits.append(logit)
         out = warp(frames, _enlarged(tilt, SCALES[-1])).unflatten(0, (batch, count))
@@ -190,6 +201,19 @@ def weighted_mean(frames_BTCHW: Tensor, logits_BT1HW: Tensor, past_BCHW: Tensor 
         mean, earlier = past_BCHW[:, None, :-1], past_BCHW[:, None, -1:]
         total, weight = total + earlier * mean, weight + earlier
     return (total / weight).to(frames_BTCHW.dtype)
+
+
+def mean_free(tilts_BT2HW: Tensor, logits_BT1HW: Tensor, past_B1HW: Tensor | None = None) -> Tensor:
+    """Tilts less their mean over time by confidence.
+
+    Args:
+        past_B1HW: sum of the confidence of earlier frames, whose tilts had mean zero.
+    """
+    weights = torch.sigmoid(logits_BT1HW.float())
+    total, weight = (weights * tilts_BT2HW).sum(1, keepdim=True), weights.sum(1, keepdim=True)
+    if past_B1HW is not None:
+        weight = weight + past_B1HW[:, None]
+    return (tilts_BT2HW - total / weight).to(tilts_BT2HW.dtype)
 
 
 def _enlarged(x_NCHW: Tensor, factor: int) -> Tensor:

@@ -39,12 +39,14 @@ class Finetuning(Redegradation):
     def unsupervised(self, frames_BTCHW: Tensor, fused_BCHW: Tensor, shift: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of clips without truth, and what it is made of; frame t is compared with frame t + shift as well."""
         net = self.net
-        restored, code = net.restorer(frames_BTCHW), net.code(frames_BTCHW)
+        (restored, scene), code = self.restored(frames_BTCHW), net.code(frames_BTCHW)
         own = charbonnier(net.degradation(restored, code), frames_BTCHW)
         other = Code(*(part.roll(-shift, dims=1) for part in code))
         cross = charbonnier(net.degradation(restored, other), frames_BTCHW.roll(-shift, dims=1))
         still = fused_BCHW[:, None].expand_as(restored)
         agree = charbonnier(restored, still) + self.hparams["frequency_weight"] * frequency_loss(restored, still)
+        if scene is not None:
+            agree = agree + self.hparams["scene_weight"] * charbonnier(scene, fused_BCHW[:, None].expand_as(scene))
         prior = net.degradation.prior(code)
         loss = own + cross + self.hparams["agree_weight"] * agree + self.hparams["prior_weight"] * prior
         return loss, {"redegraded": own, "cross": cross, "agree": agree, "prior": prior}

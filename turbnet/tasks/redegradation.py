@@ -7,8 +7,9 @@ from torch import Tensor
 from turbnet.data.clips import Scene, SimulatedScene
 from turbnet.data.pairs import Pair
 from turbnet.nets.redegradation import Redegraded, Redegrading
+from turbnet.nets.restorer import Restorer
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
-from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, tilt_error, tilt_loss
+from turbnet.tasks.losses import charbonnier, frequency_loss, moving_weights, psnr, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
 
 
@@ -17,8 +18,9 @@ class Redegradation(SimulatedTask):
     of the frames, and the restored frames so degraded, with the frames, the code's tilt with the true one.
 
     Args:
-        frequency_weight, redegradation_weight, tilt_weight: of the frequency loss, of both distances to the frames, of the
-            tilt's likelihood.
+        frequency_weight, redegradation_weight, tilt_weight, scene_weight: of the frequency loss, of both distances to the
+            frames, of the tilt's likelihood, of the distance of the still scene that a restorer of clips makes. Without a
+            loss of its own a scene that falls behind is shut out by the gate and learns no more.
         start_from: checkpoint of the same network, or of its restorer alone, to start from; or a released network's name.
         more: see `SimulatedTask`.
     """
@@ -30,6 +32,7 @@ class Redegradation(SimulatedTask):
         frequency_weight: float = 0.1,
         redegradation_weight: float = 0.5,
         tilt_weight: float = 0.01,
+        scene_weight: float = 0.6,
         start_from: str | None = None,
         **more: Any,
     ) -> None:
@@ -37,6 +40,7 @@ class Redegradation(SimulatedTask):
             frequency_weight=frequency_weight,
             redegradation_weight=redegradation_weight,
             tilt_weight=tilt_weight,
+            scene_weight=scene_weight,
             **more,
         )
         if start_from is not None:
@@ -54,7 +58,8 @@ class Redegradation(SimulatedTask):
         pair = pair.settled() if pair.frames.shape[1] > 1 else pair  # of a frame alone no tilt is seen
         net, weight = self.net, self.hparams["redegradation_weight"]
         registered = net.code.tilt(pair.frames)
-        restored, code = net.restorer(pair.frames), net.code(pair.frames, registered)
+        restored, scene = self.restored(pair.frames)
+        code = net.code(pair.frames, registered)
         found = Redegraded(restored, code, net.degradation(restored, code))
         distance = charbonnier(restored, pair.target)
         truly = charbonnier(net.degradation(pair.target, code), pair.frames)
@@ -62,10 +67,20 @@ class Redegradation(SimulatedTask):
         loss = distance + self.hparams["frequency_weight"] * frequency_loss(restored, pair.target)
         loss = loss + weight * (truly + again)
         values = {"charbonnier": distance, "true_redegraded": truly, "redegraded": again}
+        if scene is not None:
+            values["scene"] = charbonnier(scene, pair.target, weight=moving_weights(pair.target, 0.0))
+            loss = loss + self.hparams["scene_weight"] * values["scene"]
         if pair.frames.shape[1] > 1:
             loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)
             values["tilt_px"] = tilt_error(registered, pair.tilt)
         return loss, values, found
+
+    def restored(self, frames_BTCHW: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The restored frames and, of a restorer of clips, the still scene that they share."""
+        if not isinstance(self.net.restorer, Restorer):
+            return self.net.restorer(frames_BTCHW), None
+        stages = self.net.restorer.stages(frames_BTCHW)
+        return stages.frames, stages.scene
 
     def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
         pair = self.pair(batch)
