@@ -94,6 +94,7 @@ class _Level(nn.Module):
             nn.ReLU(),
         )
         self.correction = conv3x3(width, 2)
+        self.correction.bias = None  # it would be a tilt that all frames share, which is taken out
         self.gate = conv3x3(width, 1)
         self.certainty = conv3x3(width, 1)
         zero_start(self.correction)
