@@ -36,9 +36,7 @@ def restore(
     ] = None,
     crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
-    passes: Annotated[
-        int, typer.Option(help="how often; a second pass for blur stronger than one can undo, text above all")
-    ] = 1,
+    passes: Annotated[int, typer.Option(help="how often; a second pass for blur stronger than one can undo")] = 1,
     skip: Annotated[
         bool, typer.Option("--skip/--no-skip", help="leave out what needs no restoration or has not changed")
     ] = False,
