@@ -62,11 +62,12 @@ def bound(clean_THW: np.ndarray, window: int, multiple: int, fitted: bool) -> tu
     sides = clean_THW.shape[1:]
     step = window - window_overlap(window)
     kept = clean_THW[: step + window].mean(0)
+    levels = _block_means(kept[None])[0].ravel()
     changes = []
     for frame in clean_THW:
         known = kept
         if fitted:
-            slope, level = _line(_block_means(kept[None])[0].ravel(), _block_means(frame[None])[0].ravel())
+            slope, level = _line(levels, _block_means(frame[None])[0].ravel())
             known = slope * kept + level
         changes.append(_block_means((frame - known)[None] ** 2)[0])
     shares, missed = [1.0, 1.0], [0.0, 0.0]

@@ -210,11 +210,8 @@ def mean_free(tilts_BT2HW: Tensor, logits_BT1HW: Tensor, past_B1HW: Tensor | Non
     Args:
         past_B1HW: sum of the confidence of earlier frames, whose tilts had mean zero.
     """
-    weights = torch.sigmoid(logits_BT1HW.float())
-    total, weight = (weights * tilts_BT2HW).sum(1, keepdim=True), weights.sum(1, keepdim=True)
-    if past_B1HW is not None:
-        weight = weight + past_B1HW[:, None]
-    return (tilts_BT2HW - total / weight).to(tilts_BT2HW.dtype)
+    past_B3HW = None if past_B1HW is None else F.pad(past_B1HW, (0, 0, 0, 0, 2, 0))
+    return tilts_BT2HW - weighted_mean(tilts_BT2HW, logits_BT1HW, past_B3HW)
 
 
 def _enlarged(x_NCHW: Tensor, factor: int) -> Tensor:

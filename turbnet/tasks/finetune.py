@@ -46,7 +46,7 @@ class Finetuning(Redegradation):
         still = fused_BCHW[:, None].expand_as(restored)
         agree = charbonnier(restored, still) + self.hparams["frequency_weight"] * frequency_loss(restored, still)
         if scene is not None:
-            agree = agree + self.hparams["scene_weight"] * charbonnier(scene, fused_BCHW[:, None].expand_as(scene))
+            agree = agree + self.hparams["scene_weight"] * charbonnier(scene, still[:, :1])
         prior = net.degradation.prior(code)
         loss = own + cross + self.hparams["agree_weight"] * agree + self.hparams["prior_weight"] * prior
         return loss, {"redegraded": own, "cross": cross, "agree": agree, "prior": prior}

@@ -72,6 +72,11 @@ def frequency_loss(a: Tensor, b: Tensor) -> Tensor:
     return torch.sqrt(difference.real.square() + difference.imag.square() + 1e-8).mean()
 
 
+def scene_loss(scene_B1CHW: Tensor, target: Tensor) -> Tensor:
+    """Charbonnier distance of the still scene to the target where that is still."""
+    return charbonnier(scene_B1CHW, target, weight=moving_weights(target, 0.0))
+
+
 def gate_loss(restored: Restored, target: Tensor) -> Tensor:
     r"""Cross-entropy of the gate against which is nearer the target, frame or still scene, by how much that matters:
 

@@ -9,7 +9,7 @@ from turbnet.data.pairs import Pair
 from turbnet.nets.redegradation import Redegraded, Redegrading
 from turbnet.nets.restorer import Restorer
 from turbnet.tasks.checkpoint import load_net, read_checkpoint
-from turbnet.tasks.losses import charbonnier, frequency_loss, moving_weights, psnr, tilt_error, tilt_loss
+from turbnet.tasks.losses import charbonnier, frequency_loss, psnr, scene_loss, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
 
 
@@ -68,7 +68,7 @@ class Redegradation(SimulatedTask):
         loss = loss + weight * (truly + again)
         values = {"charbonnier": distance, "true_redegraded": truly, "redegraded": again}
         if scene is not None:
-            values["scene"] = charbonnier(scene, pair.target, weight=moving_weights(pair.target, 0.0))
+            values["scene"] = scene_loss(scene, pair.target)
             loss = loss + self.hparams["scene_weight"] * values["scene"]
         if pair.frames.shape[1] > 1:
             loss = loss + self.hparams["tilt_weight"] * tilt_loss(registered, pair.tilt)

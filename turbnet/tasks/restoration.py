@@ -20,6 +20,7 @@ from turbnet.tasks.losses import (
     moving_weights,
     psnr,
     registration_loss,
+    scene_loss,
     tilt_error,
     tilt_loss,
 )
@@ -103,7 +104,7 @@ class Restoration(SimulatedTask):
         values = {"charbonnier": distance}
         if stages:
             values["own"] = charbonnier(stages.own, pair.target, weight=counts)
-            values["scene"] = charbonnier(stages.scene, pair.target, weight=moving_weights(pair.target, 0.0))
+            values["scene"] = scene_loss(stages.scene, pair.target)
             values["gate"] = gate_loss(stages, pair.target)
             for name in ("own", "scene", "gate"):
                 loss = loss + self.hparams[f"{name}_weight"] * values[name]
