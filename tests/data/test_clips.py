@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import default_collate
 
-from turbnet.data.clips import CleanClips, EpochSampler, SimulatedClips
+from turbnet.data.clips import CleanClips, DrawnClips, EpochSampler, SimulatedClips
 from turbnet.data.module import ClipData
 from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Text
@@ -167,7 +168,24 @@ class TestFramesAndHardness:
             for name in ("frames", "target", "blur_only", "tilt"):
                 assert torch.equal(seen[name], getattr(pair, name)[0]), name
 
+    def test_drawn_where_they_are_made_they_are_the_same_pairs(self):
+        clips = CleanClips(self.source, 4, 2, 16, 16, moving=0.5)
+        maker = PairMaker(
+            16, 16, modes=6, components=2, d_over_r0=(0.0, 4.0), blurred=1.0, geometries=2, aperture=(0.17, 0.24)
+        )
+        drawn = default_collate([DrawnClips(clips, maker)[index] for index in range(3)])
+        arguments = drawn["scene"], drawn["seed"].tolist(), drawn["hardness"].tolist()
+        there, here = maker(*arguments, drawn["coefficients"]), maker(*arguments)
+        for name in ("frames", "target", "blur_only", "tilt"):
+            assert torch.equal(getattr(there, name), getattr(here, name)), name
+
     @pytest.mark.parametrize("frames", [(3, 2), (0, 2)])
     def test_a_range_that_is_none(self, frames):
         with pytest.raises(ParameterError, match="frames"):
             CleanClips(self.source, 4, frames, 8, 8)
+
+
+def test_drawing_alone_needs_the_exact_simulator():
+    for simulator in (None, {"model": "warp-blur"}):
+        with pytest.raises(ParameterError, match="drawn"):
+            ClipData(simulator=simulator, drawn=True)

@@ -42,6 +42,20 @@ def test_the_seed_decides_alone_or_in_a_batch(maker, scene):
         assert torch.equal(getattr(batch, name)[1:2], getattr(alone, name)), name
 
 
+@pytest.mark.parametrize("model", ["zernike", "direct-to-image", "warp-blur"])
+def test_clips_of_one_geometry_can_be_simulated_together(scene, monkeypatch, model):
+    """As on a GPU: the same pairs but for the order of sums."""
+    maker = PairMaker(64, 64, geometries=2, aperture=(0.17, 0.24), model=model, blurred=0.5, **SMALL)
+    scenes, seeds = scene.expand(5, -1, -1, -1, -1), [3, 4, 5, 6, 7]
+    each = maker(scenes, seeds)
+    batches = PairMaker._batches
+    monkeypatch.setattr(PairMaker, "_batches", lambda self, conditions, together: batches(conditions, True))
+    together = maker(scenes, seeds)
+    assert len({maker.conditions(seed).geometry for seed in seeds}) == 2
+    for name in ("frames", "blur_only", "tilt"):
+        torch.testing.assert_close(getattr(together, name), getattr(each, name), rtol=0, atol=1e-4)
+
+
 def test_still_air_returns_the_clean_clip(scene):
     pair = PairMaker(64, 64, d_over_r0=(0.0, 0.0), **SMALL, **SILENT)(scene, [0])
     torch.testing.assert_close(pair.frames, scene, rtol=0, atol=1e-5)

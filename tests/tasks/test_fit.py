@@ -135,6 +135,13 @@ def test_the_seed_decides_the_run(train, tmp_path, stage_one, weights):
     assert not same(first, weights(other / "checkpoints/last.ckpt"))
 
 
+@pytest.mark.parametrize("drawn", [False, True])
+def test_where_turbulence_is_made_does_not_matter(train, tmp_path, stage_one, weights, drawn):
+    elsewhere = ("data.workers=1", "data.simulator=${simulator}", f"data.drawn={drawn}")
+    run = train(tmp_path, "task=tilt", *elsewhere)
+    assert same(weights(stage_one / "checkpoints/last.ckpt"), weights(run / "checkpoints/last.ckpt"))
+
+
 def test_second_stage_starts_from_the_first_and_may_freeze_it(train, tmp_path, stage_one, weights):
     start = stage_one / "checkpoints/last.ckpt"
     second = train(tmp_path, f"task.start_from={start}", "task.freeze=[tilt]", "task.weight_decay=0.1")

@@ -25,7 +25,7 @@ SMALL: dict[str, list[dict[str, Any]]] = {
             "tcja": {"width": 8, "depth": 1},
             "scene": _U,
             "own": {"width": 6, "depth": 1},
-            "inverse": {"strengths": (2.0,), "size": 5},
+            "deconvolution": {"strengths": (2.0,)},
             "fusions": 2,
         }
     ],

@@ -1,7 +1,7 @@
 """Clean clips: still scenes, and scenes in which something moves."""
 
 from collections.abc import Sequence
-from typing import Any, TypedDict, final
+from typing import Any, TypedDict, cast, final
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch.utils.data import Dataset, DistributedSampler
 from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Source
 from turbnet.errors import check_range
+from turbnet.simulate.draw import Draw
 
 
 @final
@@ -28,6 +29,18 @@ class Scene(TypedDict):
 
 
 @final
+class DrawnScene(TypedDict):
+    """A clean clip and the atmosphere through which it will be seen: coefficients (T, J-1, h, w) of
+    `turbnet.simulate.draw.Draw`; the rest as in `Scene`.
+    """
+
+    scene: Tensor
+    seed: Tensor
+    hardness: Tensor
+    coefficients: Tensor
+
+
+@final
 class SimulatedScene(TypedDict):
     """One clip that has been seen through turbulence; see `turbnet.data.pairs.Pair`."""
 
@@ -36,6 +49,10 @@ class SimulatedScene(TypedDict):
     blur_only: Tensor
     tilt: Tensor
     seed: Tensor
+
+
+AnyScene = Scene | DrawnScene | SimulatedScene
+"""What a data loader may give to a task."""
 
 
 class CleanClips(Dataset[Scene]):
@@ -138,6 +155,28 @@ class SimulatedClips(Dataset[SimulatedScene]):
             "tilt": pair.tilt[0],
             "seed": clean["seed"],
         }
+
+
+class DrawnClips(Dataset[DrawnScene]):
+    """Clean clips with atmospheres that are drawn in the workers of a data loader; who trains looks through them.
+
+    Drawing is many small steps, which a GPU does no faster than a processor; looking is what a GPU is good at.
+
+    Args:
+        clips: clean clips.
+        pairs: draws.
+    """
+
+    def __init__(self, clips: CleanClips, pairs: PairMaker) -> None:
+        self.clips, self.pairs = clips, pairs
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, index: int) -> DrawnScene:
+        clean = self.clips[index]
+        draw = cast(Draw, self.pairs.draw(int(clean["seed"]), len(clean["scene"]), float(clean["hardness"])))
+        return {**clean, "coefficients": draw.coefficients[0]}
 
 
 class EpochSampler(DistributedSampler[Any]):

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
-from turbnet.data.clips import CleanClips, EpochSampler, SimulatedClips
+from turbnet.data.clips import CleanClips, DrawnClips, EpochSampler, SimulatedClips
 from turbnet.data.pack import PackedPicture
 from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Mixture, Pictures, Source, Text, embedded_paths, folder_paths
@@ -33,7 +33,9 @@ class ClipData(L.LightningDataModule):
         curriculum: training steps over which strength rises from a quarter of its range to all of it.
         workers: processes that make clips; the clips do not depend on their number.
         simulator: arguments of `turbnet.data.pairs.PairMaker`: turbulence is then simulated here, in the workers, and not
-            in the training loop. The pairs are the same; worth it where the loop runs on a GPU or few cores idle.
+            in the training loop. The pairs are the same; worth it where few cores idle.
+        drawn: with `simulator`: only the atmospheres are drawn in the workers, and the training loop looks through them. The
+            pairs are the same; worth it where the loop runs on a GPU.
         seed: of the clips.
 
     Raises:
@@ -55,6 +57,7 @@ class ClipData(L.LightningDataModule):
         curriculum: int = 0,
         workers: int = 0,
         simulator: Mapping[str, Any] | None = None,
+        drawn: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -74,7 +77,9 @@ class ClipData(L.LightningDataModule):
 
         train = source(folder_paths(folders) if folders else embedded_paths("train"))
         val = source(folder_paths(val_folders) if val_folders else embedded_paths("test"))
-        self.curriculum, self.simulator = curriculum, simulator
+        self.curriculum, self.simulator, self.drawn = curriculum, simulator, drawn
+        if drawn and (simulator is None or simulator.get("model", "zernike") != "zernike"):
+            raise ParameterError("drawn: data.simulator must be the exact simulator, '${simulator}'")
         self.pairs: PairMaker | None = None
         most = frames if isinstance(frames, int) else frames[-1]
         self.train = CleanClips(train, steps_per_epoch * batch_size, frames, size, size, moving, seed)
@@ -84,8 +89,11 @@ class ClipData(L.LightningDataModule):
     def _loader(self, clips: CleanClips, sampler: EpochSampler | None) -> DataLoader[Any]:
         if self.simulator is not None and self.pairs is None:
             self.pairs = PairMaker(**self.simulator)
+        made: Dataset[Any] = clips
+        if self.pairs is not None:
+            made = (DrawnClips if self.drawn else SimulatedClips)(clips, self.pairs)
         return DataLoader(
-            clips if self.pairs is None else SimulatedClips(clips, self.pairs),
+            made,
             batch_size=self.batch_size,
             sampler=sampler,
             num_workers=self.workers,

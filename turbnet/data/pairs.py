@@ -1,7 +1,7 @@
 """The pair maker: clean clips in, turbulent clips with their truth out, inside the training loop."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, cast
 
 import numpy as np
@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import ParameterError, check_range
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.simulate.draw import Draw
 from turbnet.simulate.ranges import Conditions, Ranges
-from turbnet.simulate.simple import DirectToImage, WarpBlur
+from turbnet.simulate.simple import DirectToImage, GaussianDraw, WarpBlur
 from turbnet.simulate.simulator import Simulator
 from turbnet.simulate.tilt import displacement, sample
 
@@ -117,30 +118,72 @@ class PairMaker(nn.Module):
         """What the clip of this seed is seen through."""
         return self.ranges.sample(torch.Generator().manual_seed(int(seed)), check_range("hardness", hardness, 0, 1))
 
+    def draw(self, seed: int, frames: int, hardness: float = 1.0) -> "Draw | GaussianDraw":
+        """The atmosphere of the clip of this seed, seen by a camera that points at the clip's mean position: a shift common
+        to all frames cannot be told from another aim.
+        """
+        through = self.conditions(seed, hardness)
+        wind = None if through.wind is None else torch.tensor(through.wind)
+        strength = torch.tensor([through.d_over_r0])
+        simulator = self._simulator(through.geometry)
+        return simulator.draw([through.draw_seed], frames, wind, self.ranges.frame_rate, strength).centred()
+
     @torch.no_grad()
-    def forward(self, scene_BTCHW: Tensor, seeds: Sequence[int], hardness: Sequence[float] | None = None) -> Pair:
+    def forward(
+        self,
+        scene_BTCHW: Tensor,
+        seeds: Sequence[int],
+        hardness: Sequence[float] | None = None,
+        coefficients: Tensor | None = None,
+    ) -> Pair:
         """Look at each clean sRGB clip through an atmosphere of its own.
 
-        The camera points at the clip's mean position: a shift common to all frames cannot be told from another aim.
+        A GPU, which many clips at once keep busy, simulates those of one geometry together; a processor each by itself, so
+        that it is the same to the last bit in any batch.
+
+        Args:
+            coefficients: those of `draw`, if the atmospheres have been drawn elsewhere, (B, T, J-1, h, w).
         """
         clean, hardness = to_linear(scene_BTCHW), hardness or [1.0] * len(seeds)
         conditions = [self.conditions(*drawn) for drawn in zip(seeds, hardness, strict=True)]
-        made = [self._clip(scene, through) for scene, through in zip(clean.split(1), conditions, strict=True)]
-        frames, blur_only, tilt = (torch.cat(parts) for parts in zip(*made, strict=True))
+        parts: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        for clips in self._batches(conditions, clean.is_cuda):
+            simulator = self._simulator(conditions[clips[0]].geometry)
+            if coefficients is None:
+                air = _together([self.draw(seeds[k], scene_BTCHW.shape[1], hardness[k]) for k in clips])
+            else:
+                air = Draw(coefficients[clips], simulator.stride, simulator.margin)
+            seen = simulator(clean[clips], air)
+            for place, k in enumerate(clips):
+                one = slice(place, place + 1)
+                parts[k] = self._sensed(seen.frames[one], seen.blur_only[one], conditions[k]) + (seen.tilt[one],)
+        frames, blur_only, tilt = (torch.cat(part) for part in zip(*(parts[k] for k in sorted(parts)), strict=True))
         return Pair(to_srgb(frames.clamp(0, 1)), scene_BTCHW, to_srgb(blur_only.clamp(0, 1)), tilt)
 
-    def _clip(self, scene_1TCHW: Tensor, seen_through: Conditions) -> tuple[Tensor, Tensor, Tensor]:
-        simulator = cast(Simulator | DirectToImage | WarpBlur, self.simulators[seen_through.geometry])
-        wind = None if seen_through.wind is None else torch.tensor(seen_through.wind)
-        strength = torch.tensor([seen_through.d_over_r0])
-        draw = simulator.draw(
-            [seen_through.draw_seed], scene_1TCHW.shape[1], wind, self.ranges.frame_rate, strength
-        ).centred()
-        seen = simulator(scene_1TCHW, draw)
-        frames, blur_only = seen.frames, seen.blur_only
+    def _simulator(self, geometry: int) -> "Simulator | DirectToImage | WarpBlur":
+        return cast(Simulator | DirectToImage | WarpBlur, self.simulators[geometry])
+
+    @staticmethod
+    def _batches(conditions: Sequence[Conditions], together: bool) -> list[list[int]]:
+        """Numbers of the clips that are simulated at once."""
+        if not together:
+            return [[clip] for clip in range(len(conditions))]
+        batches: dict[int, list[int]] = {}
+        for clip, through in enumerate(conditions):
+            batches.setdefault(through.geometry, []).append(clip)
+        return list(batches.values())
+
+    @staticmethod
+    def _sensed(frames: Tensor, blur_only: Tensor, seen_through: Conditions) -> tuple[Tensor, Tensor]:
         if seen_through.defocus > 0:
             frames, blur_only = (defocused(clip, seen_through.defocus) for clip in (frames, blur_only))
-        return seen_through.sensor(frames, seen_through.noise_seed), blur_only, seen.tilt
+        return seen_through.sensor(frames, seen_through.noise_seed), blur_only
+
+
+def _together(draws: Sequence[Any]) -> Any:
+    """Draws of one clip each as one of several."""
+    tensors = [field.name for field in fields(draws[0]) if isinstance(getattr(draws[0], field.name), Tensor)]
+    return replace(draws[0], **{name: torch.cat([getattr(draw, name) for draw in draws]) for name in tensors})
 
 
 def defocused(clip_BTCHW: Tensor, sigma: float) -> Tensor:

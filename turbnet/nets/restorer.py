@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbnet.nets.inverse import InverseFilters
+from turbnet.nets.deconvolution import Deconvolution
 from turbnet.nets.own import OwnFrame
 from turbnet.nets.scene import LuckyFusion, SceneNet
 from turbnet.nets.tcja import TCJATransformer
@@ -64,7 +64,7 @@ class Restorer(nn.Module):
         tcja: arguments of `TCJATransformer`.
         scene: `widths` and `depths` of `SceneNet`.
         own: `width` and `depth` of `OwnFrame`.
-        inverse: arguments of `InverseFilters`.
+        deconvolution: arguments of `Deconvolution`.
         fusions: pictures of the lucky fusion.
     """
 
@@ -74,7 +74,7 @@ class Restorer(nn.Module):
         tcja: Mapping[str, Any] | None = None,
         scene: Mapping[str, Any] | None = None,
         own: Mapping[str, Any] | None = None,
-        inverse: Mapping[str, Any] | None = None,
+        deconvolution: Mapping[str, Any] | None = None,
         fusions: int = 3,
     ) -> None:
         super().__init__()
@@ -82,9 +82,9 @@ class Restorer(nn.Module):
         self.tcja = TCJATransformer(**(tcja or {}))
         width, patch = self.tcja.width, self.tcja.patch
         self.fusion = LuckyFusion(width, patch, fusions)
-        self.inverse = InverseFilters(**(inverse or {}))
-        filters = len(self.inverse.weight)
-        self.scene = SceneNet(3 * (fusions + filters), width, blends=filters, hints=2, **(scene or {}))
+        self.deconvolution = Deconvolution(**(deconvolution or {}))
+        guesses = self.deconvolution.count
+        self.scene = SceneNet(3 * (fusions + guesses), width, blends=guesses, hints=2, **(scene or {}))
         self.own = OwnFrame(width, patch, **(own or {}))
         self.size_multiple = math.lcm(self.tilt.size_multiple, patch, self.scene.size_multiple)
 
@@ -103,10 +103,10 @@ class Restorer(nn.Module):
         if past is not None:
             earlier = torch.cat((past.pictures[:, :, :-1], past.pictures[:, :, -1:] + _NO_WEIGHT), dim=2)
         pictures, weight = self.fusion(registered.frames, features, confidence, earlier)
-        # Of the plain mean: its blur is the mean PSF, which the filters know; that of a lucky picture is not.
-        sharpened = self.inverse(registered.reference[:, 0])
+        # Of the plain mean: its blur is the mean PSF, which the kernels know; that of a lucky picture is not.
+        guesses = self.deconvolution(registered.reference[:, 0])
         sums = _sums(registered.tilts[-1], past)
-        seen = torch.cat((pictures, sharpened), dim=1).flatten(1, 2)
+        seen = torch.cat((pictures, guesses), dim=1).flatten(1, 2)
         scene = self.scene(seen, gathered, hints_BCHW=dance(sums))[:, None]
         own, gate = self.own(frames_BTCHW, registered.frames, scene, registered.drift, features)
         total = confidence.sum(1) if past is None else confidence.sum(1) + past.reference[:, -1:]

@@ -6,8 +6,8 @@ First a learned lucky fusion: K pictures, each a mean of the registered frames w
     F_k(x) = \sum_t w_{k,t}(x)\, I_t(x), \qquad w_{k,t} = \mathrm{softmax}_t\, (\ell_{k,t} + \log c_t)
 
 from logits l that the frames' features give and the confidence c of the registration. Then a U-Net on half, a quarter and
-an eighth of the resolution sharpens the first of them, knowing the others, what inverse filters (`turbnet.nets.inverse`)
-make of the mean of the registered frames, and what the reference gathered. However many frames a clip has, this part runs
+an eighth of the resolution sharpens the first of them, knowing the others, what deconvolution (`turbnet.nets.deconvolution`)
+makes of the mean of the registered frames, and what the reference gathered. However many frames a clip has, this part runs
 once: a deep network at a small cost a frame.
 """
 

@@ -105,7 +105,7 @@ def _piece(
     size = [_fast(n + half, 4 if factor > 1 else 1) for n in sides]
     padded = F.pad(image, (0, size[1] - sides[1], 0, size[0] - sides[0]))
     beta = _fine_weights(weights_BMhw, stride, factor, offset, size)
-    blurred = _Scatter.apply(padded, beta, *basis.transfer(size, image.dtype, factor), factor)
+    blurred = _Scatter.apply(padded, beta, *basis.transfer(size, image, factor), factor)
     top, left = rows[0] - offset[0], columns[0] - offset[1]
     cut: Tensor = blurred[..., top : top + rows[1] - rows[0], left : left + columns[1] - columns[0]]
     return cut

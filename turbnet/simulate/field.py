@@ -196,7 +196,8 @@ class ZernikeField(nn.Module):
 
     @property
     def _grid_cell(self) -> Tensor:
-        return torch.tensor(self._step, dtype=torch.float64)[:, None, None]  # of k along x and y
+        # Of k along x and y.
+        return torch.tensor(self._step, dtype=torch.float64, device=self._grid_k.device)[:, None, None]
 
     def draw(
         self,

@@ -184,25 +184,25 @@ class PSFBasis:
         """PSFs (P, K, K) from their weights."""
         return self.mean.to(weights_PM) + torch.einsum("pm,mij->pij", weights_PM, self.components.to(weights_PM))
 
-    def transfer(self, size: Sequence[int], dtype: torch.dtype, factor: int = 1) -> Tensor:
+    def transfer(self, size: Sequence[int], like: Tensor, factor: int = 1) -> list[Tensor]:
         """Transfer functions of mean and components on the half-plane of an FFT of `size`, complex.
 
         Args:
             size: rows and columns of the FFT.
-            dtype: of the pictures.
+            like: the pictures, for their precision and device.
             factor: keep only what an FFT of 1 / factor of the size holds of the components.
 
         Returns:
             a list of two: (rows, columns // 2 + 1) of the mean, (M, ...) of the components.
         """
-        key = (tuple(size), dtype, factor)
+        key = (tuple(size), like.dtype, like.device, factor)
         if key not in self._transfers:
             half = self.size // 2
-            kernels = torch.cat((self.mean[None], self.components)).to(dtype)
+            kernels = torch.cat((self.mean[None], self.components)).to(like)
             kernels = F.pad(kernels, (0, size[1] - self.size, 0, size[0] - self.size))
             whole = torch.fft.rfft2(kernels.roll((-half, -half), (1, 2)))
-            self._transfers[key] = [whole[0], low_band(whole[1:], factor) * roll_off(tuple(size), factor).to(dtype)]
-        return self._transfers[key]  # type: ignore[return-value]
+            self._transfers[key] = [whole[0], low_band(whole[1:], factor) * roll_off(tuple(size), factor).to(like)]
+        return self._transfers[key]
 
     @cached_property
     def _transfers(self) -> dict[object, list[Tensor]]:

@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.data.clips import AnyScene
 from turbnet.nets.redegradation import Code
 from turbnet.tasks.losses import charbonnier, frequency_loss
 from turbnet.tasks.redegradation import Redegradation
@@ -51,7 +51,7 @@ class Finetuning(Redegradation):
         loss = own + cross + self.hparams["agree_weight"] * agree + self.hparams["prior_weight"] * prior
         return loss, {"redegraded": own, "cross": cross, "agree": agree, "prior": prior}
 
-    def step(self, batch: dict[str, Scene | SimulatedScene], stage: str) -> Tensor:  # type: ignore[override]
+    def step(self, batch: dict[str, AnyScene], stage: str) -> Tensor:  # type: ignore[override]
         cuts: dict[str, Tensor] = batch["clips"]  # type: ignore[assignment]
         clips = cuts["scene"].float()
         shift = 1 + int(cuts["seed"][0]) % max(clips.shape[1] - 1, 1)

@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.data.clips import AnyScene
 from turbnet.data.pairs import Pair
 from turbnet.nets.redegradation import Redegraded, Redegrading
 from turbnet.nets.restorer import Restorer
@@ -82,7 +82,7 @@ class Redegradation(SimulatedTask):
         stages = self.net.restorer.stages(frames_BTCHW)
         return stages.frames, stages.scene
 
-    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
+    def step(self, batch: AnyScene, stage: str) -> Tensor:
         pair = self.pair(batch)
         loss, values, found = self.supervised(pair)
         values["loss"] = loss

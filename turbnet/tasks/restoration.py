@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.data.clips import AnyScene
 from turbnet.errors import InputError, check_range
 from turbnet.nets.dncnn import DnCNN
 from turbnet.nets.restorer import Restorer
@@ -89,7 +89,7 @@ class Restoration(SimulatedTask):
     def _registers(self) -> bool:
         return isinstance(self.net, Restorer)
 
-    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
+    def step(self, batch: AnyScene, stage: str) -> Tensor:
         pair = self.pair(batch)
         enough = pair.frames.shape[1] >= self.hparams["settled"]
         seen = pair.settled() if enough or self._registers else pair

@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch.utilities.rank_zero import rank_zero_warn
 from torch import Tensor, nn
 
-from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.data.clips import AnyScene
 from turbnet.data.pairs import Pair, PairMaker
 from turbnet.errors import InputError, check_range
 from turbnet.nets import build
@@ -89,7 +89,7 @@ class SimulatedTask(L.LightningModule):
         """The parameters that this task learns."""
         return self.net.parameters()
 
-    def pair(self, batch: Scene | SimulatedScene) -> Pair:
+    def pair(self, batch: AnyScene) -> Pair:
         """Turbulent clips for a batch of clean ones, always in float32; those that a worker made pass through."""
         if "frames" in batch:
             return Pair(batch["frames"], batch["target"], batch["blur_only"], batch["tilt"])
@@ -97,15 +97,16 @@ class SimulatedTask(L.LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             if not self._pairs:
                 self._pairs.append(PairMaker(**self.hparams["simulator"]).to(self.device))
-            pair = self._pairs[0](batch["scene"].float(), batch["seed"].tolist(), batch["hardness"].tolist())
+            conditions = batch["seed"].tolist(), batch["hardness"].tolist()
+            pair = self._pairs[0](batch["scene"].float(), *conditions, batch.get("coefficients"))
         self._simulated += time.perf_counter() - began
         return pair
 
-    def on_train_batch_start(self, batch: Scene | SimulatedScene, index: int) -> None:
+    def on_train_batch_start(self, batch: AnyScene, index: int) -> None:
         """The simulator's time is counted anew for each step."""
         self._simulated = 0.0
 
-    def on_train_batch_end(self, outputs: Any, batch: Scene | SimulatedScene, index: int) -> None:
+    def on_train_batch_end(self, outputs: Any, batch: AnyScene, index: int) -> None:
         """Logs clips a second and the simulator's part of the time since the last step ended, in this process."""
         now = time.perf_counter()
         if self._began:
@@ -137,13 +138,13 @@ class SimulatedTask(L.LightningModule):
             )
 
     @abstractmethod
-    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
+    def step(self, batch: AnyScene, stage: str) -> Tensor:
         """Loss of one batch; reports what it measures under `stage`, "train" or "val"."""
 
-    def training_step(self, batch: Scene | SimulatedScene, index: int) -> Tensor:
+    def training_step(self, batch: AnyScene, index: int) -> Tensor:
         return self.step(batch, "train")
 
-    def validation_step(self, batch: Scene | SimulatedScene, index: int) -> None:
+    def validation_step(self, batch: AnyScene, index: int) -> None:
         self.step(batch, "val")
 
     def configure_optimizers(self) -> Any:

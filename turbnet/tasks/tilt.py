@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from turbnet.data.clips import Scene, SimulatedScene
+from turbnet.data.clips import AnyScene
 from turbnet.tasks.losses import psnr, registration_loss, tilt_error, tilt_loss
 from turbnet.tasks.simulated import SimulatedTask
 
@@ -26,7 +26,7 @@ class TiltRemoval(SimulatedTask):
         """Only the tilt net."""
         return self.net.tilt.parameters()
 
-    def step(self, batch: Scene | SimulatedScene, stage: str) -> Tensor:
+    def step(self, batch: AnyScene, stage: str) -> Tensor:
         pair = self.pair(batch).settled()
         registered = self.net.tilt(pair.frames)
         distance = registration_loss(pair.frames, pair.blur_only, registered.tilts)
