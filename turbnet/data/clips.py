@@ -175,7 +175,8 @@ class DrawnClips(Dataset[DrawnScene]):
 
     def __getitem__(self, index: int) -> DrawnScene:
         clean = self.clips[index]
-        draw = cast(Draw, self.pairs.draw(int(clean["seed"]), len(clean["scene"]), float(clean["hardness"])))
+        through = self.pairs.conditions(int(clean["seed"]), float(clean["hardness"]))
+        draw = cast(Draw, self.pairs.draw(through, len(clean["scene"])))
         return {**clean, "coefficients": draw.coefficients[0]}
 
 

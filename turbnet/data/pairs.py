@@ -118,11 +118,10 @@ class PairMaker(nn.Module):
         """What the clip of this seed is seen through."""
         return self.ranges.sample(torch.Generator().manual_seed(int(seed)), check_range("hardness", hardness, 0, 1))
 
-    def draw(self, seed: int, frames: int, hardness: float = 1.0) -> "Draw | GaussianDraw":
-        """The atmosphere of the clip of this seed, seen by a camera that points at the clip's mean position: a shift common
-        to all frames cannot be told from another aim.
+    def draw(self, through: Conditions, frames: int) -> Draw | GaussianDraw:
+        """The atmosphere of one clip, seen by a camera that points at the clip's mean position: a shift common to all frames
+        cannot be told from another aim.
         """
-        through = self.conditions(seed, hardness)
         wind = None if through.wind is None else torch.tensor(through.wind)
         strength = torch.tensor([through.d_over_r0])
         simulator = self._simulator(through.geometry)
@@ -150,7 +149,7 @@ class PairMaker(nn.Module):
         for clips in self._batches(conditions, clean.is_cuda):
             simulator = self._simulator(conditions[clips[0]].geometry)
             if coefficients is None:
-                air = _together([self.draw(seeds[k], scene_BTCHW.shape[1], hardness[k]) for k in clips])
+                air = _together([self.draw(conditions[k], scene_BTCHW.shape[1]) for k in clips])
             else:
                 air = Draw(coefficients[clips], simulator.stride, simulator.margin)
             seen = simulator(clean[clips], air)
@@ -160,7 +159,7 @@ class PairMaker(nn.Module):
         frames, blur_only, tilt = (torch.cat(part) for part in zip(*(parts[k] for k in sorted(parts)), strict=True))
         return Pair(to_srgb(frames.clamp(0, 1)), scene_BTCHW, to_srgb(blur_only.clamp(0, 1)), tilt)
 
-    def _simulator(self, geometry: int) -> "Simulator | DirectToImage | WarpBlur":
+    def _simulator(self, geometry: int) -> Simulator | DirectToImage | WarpBlur:
         return cast(Simulator | DirectToImage | WarpBlur, self.simulators[geometry])
 
     @staticmethod

@@ -26,11 +26,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbnet.atmosphere.exposure import short_exposure_factor
 from turbnet.errors import check_range
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.nets.inverse import GRID, kernel_of, short_exposure_transfer
 
-_GRID = 64
 _NEAR = 7  # pixels across what is convolved at full resolution
 DARKEST = 1e-3
 """Linear intensity: nothing is divided by less."""
@@ -84,8 +83,6 @@ class Deconvolution(nn.Module):
         ParameterError: a value out of range.
     """
 
-    size_multiple = 2
-
     def __init__(self, strengths: Sequence[float] = (2.0, 3.0, 4.5, 6.5), defocus: Sequence[float] = (2.5,)) -> None:
         super().__init__()
         self.count = len(strengths) + len(defocus)
@@ -113,12 +110,7 @@ def turbulence_kernel(d_over_r0: float, size: int = 19) -> np.ndarray:
     Raises:
         ParameterError: a value out of range.
     """
-    nu = np.fft.fftfreq(_GRID)
-    frequency = np.minimum(2 * np.hypot(nu[:, None], nu), 1.0)
-    blur = short_exposure_factor(frequency, check_range("D/r0", d_over_r0, 0.0, 100.0))
-    kernel = np.fft.fftshift(np.fft.ifft2(blur).real)
-    first = _GRID // 2 - _checked(size) // 2
-    kernel = kernel[first : first + size, first : first + size].clip(min=0)
+    kernel = kernel_of(short_exposure_transfer(d_over_r0), _checked(size)).clip(min=0)
     return (kernel / kernel.sum()).astype(np.float32)
 
 
@@ -134,7 +126,7 @@ def defocus_kernel(sigma: float, size: int = 19) -> np.ndarray:
 
 
 def _checked(size: int) -> int:
-    return int(check_range("size of a kernel", size, _NEAR, _GRID - 1, "pixels"))
+    return int(check_range("size of a kernel", size, _NEAR, GRID - 1, "pixels"))
 
 
 def _scales(kernel_kk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from turbnet.atmosphere.exposure import short_exposure_factor
 from turbnet.errors import check_range
 
-_GRID = 64
+GRID = 64
+"""Frequencies a side; no kernel is wider."""
 _NOISE = 0.02  # epsilon
 
 
@@ -37,7 +38,7 @@ class InverseFilters(nn.Module):
 
     def __init__(self, strengths: Sequence[float] = (1.5, 3.0, 4.5, 6.0), size: int = 15) -> None:
         super().__init__()
-        check_range("size of a filter", size, 1, _GRID - 1, "pixels")
+        check_range("size of a filter", size, 1, GRID - 1, "pixels")
         self.weight = nn.Parameter(torch.from_numpy(np.stack([wiener_kernel(s, size) for s in strengths]))[:, None])
 
     def forward(self, picture_BCHW: Tensor) -> Tensor:
@@ -51,10 +52,20 @@ class InverseFilters(nn.Module):
 
 def wiener_kernel(d_over_r0: float, size: int) -> np.ndarray:
     """w_s, (size, size) float32, its middle pixel the origin, sum one."""
-    nu = np.fft.fftfreq(_GRID)
-    frequency = np.minimum(2 * np.hypot(nu[:, None], nu), 1.0)
-    blur = short_exposure_factor(frequency, check_range("D/r0", d_over_r0, 0.0, 100.0))
-    kernel = np.fft.fftshift(np.fft.ifft2(blur / (blur**2 + _NOISE)).real)
-    first = _GRID // 2 - size // 2
-    kernel = kernel[first : first + size, first : first + size]
+    blur = short_exposure_transfer(d_over_r0)
+    kernel = kernel_of(blur / (blur**2 + _NOISE), size)
     return (kernel / kernel.sum()).astype(np.float32)
+
+
+def short_exposure_transfer(d_over_r0: float) -> np.ndarray:
+    """H_s on a grid of frequencies in FFT order."""
+    nu = np.fft.fftfreq(GRID)
+    frequency = np.minimum(2 * np.hypot(nu[:, None], nu), 1.0)
+    return short_exposure_factor(frequency, check_range("D/r0", d_over_r0, 0.0, 100.0))
+
+
+def kernel_of(transfer: np.ndarray, size: int) -> np.ndarray:
+    """The middle (size, size) of a transfer function's kernel."""
+    kernel = np.fft.fftshift(np.fft.ifft2(transfer).real)
+    first = GRID // 2 - size // 2
+    return kernel[first : first + size, first : first + size]
