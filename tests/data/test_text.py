@@ -2,13 +2,44 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from turbnet.data.text import fonts, random_word, render_text
+from turbnet.data.text import fonts, fonts_in, load_font, random_word, render_text
 from turbnet.data.words import WORDS
+from turbnet.errors import InputError
 
 
 def test_fonts_come_with_matplotlib():
     assert len(fonts()) >= 10
     assert all(path.is_file() for path in fonts())
+
+
+def test_fonts_of_this_machine_can_be_written_with():
+    for path in fonts_in()[:3]:
+        assert np.ptp(render_text(np.random.default_rng(0), 64, 64, [path])) > 0.05
+
+
+def test_fonts_of_folders(tmp_path):
+    """Those with letters; in subfolders too."""
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "a.ttf").write_bytes(fonts()[0].read_bytes())
+    (tmp_path / "b.ttf").write_bytes(b"no font")
+    assert fonts_in([tmp_path]) == (tmp_path / "deep" / "a.ttf",)
+    assert fonts_in([]) == ()
+    (tmp_path / "deep" / "a.ttf").unlink()
+    with pytest.raises(InputError, match="no fonts in"):
+        fonts_in([tmp_path])
+    with pytest.raises(InputError, match="there is no folder"):
+        fonts_in([tmp_path / "none"])
+
+
+def test_the_fonts_given_are_used():
+    one, other = (render_text(np.random.default_rng(5), 64, 64, [path]) for path in (fonts()[0], fonts()[-1]))
+    assert not np.array_equal(one, other)
+
+
+def test_bad_font(tmp_path):
+    (tmp_path / "none.ttf").write_bytes(b"no font")
+    with pytest.raises(InputError, match="is no font that can be read"):
+        load_font(tmp_path / "none.ttf", 12)
 
 
 @pytest.mark.parametrize("size", [(64, 64), (33, 71), (8, 200), (1, 1)])

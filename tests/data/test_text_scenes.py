@@ -7,11 +7,9 @@ from turbnet.data.text_scenes import (
     TextScenes,
     carry_points,
     homography,
-    load_font,
     render_scene,
-    system_fonts,
 )
-from turbnet.errors import InputError, ParameterError
+from turbnet.errors import ParameterError
 
 
 def scene(seed, kind=None, height=120, width=200, **options):
@@ -98,11 +96,6 @@ def test_as_a_source_of_clips():
     assert clip.shape == (3, 3, 40, 60)
 
 
-def test_system_fonts_can_be_written_with():
-    for path in system_fonts()[:3]:
-        assert scene(0, "words", font_paths=[path]).boxes
-
-
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -116,9 +109,3 @@ def test_system_fonts_can_be_written_with():
 def test_bad_parameters(options, says):
     with pytest.raises(ParameterError, match=says):
         scene(0, **options)
-
-
-def test_bad_font(tmp_path):
-    (tmp_path / "none.ttf").write_bytes(b"no font")
-    with pytest.raises(InputError, match="is no font that can be read"):
-        load_font(tmp_path / "none.ttf", 12)

@@ -7,8 +7,7 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter
 
 from turbnet.data.boxes import TextBox
-from turbnet.data.text import fonts
-from turbnet.data.text_scenes import load_font
+from turbnet.data.text import fonts, load_font
 from turbnet.data.words import WORDS
 from turbnet.deploy.weights import released_models, released_recogniser
 from turbnet.errors import InputError

@@ -5,8 +5,7 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter, shift
 
 from turbnet.data.boxes import TextBox
-from turbnet.data.text import fonts
-from turbnet.data.text_scenes import load_font
+from turbnet.data.text import fonts, load_font
 from turbnet.errors import InputError
 from turbnet.metrics.ocr_proxy import legibility_error, score_legibility
 

@@ -6,8 +6,7 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter
 
 from turbnet.data.boxes import TextBox
-from turbnet.data.text import fonts
-from turbnet.data.text_scenes import load_font
+from turbnet.data.text import fonts, load_font
 from turbnet.errors import InputError
 from turbnet.metrics.ocr_rapid import RapidReader
 from turbnet.metrics.text import score_text

@@ -11,6 +11,8 @@ from turbnet.data.clips import CleanClips, DrawnClips, EpochSampler, SimulatedCl
 from turbnet.data.pack import PackedPicture
 from turbnet.data.pairs import PairMaker
 from turbnet.data.sources import Mixture, Pictures, Source, Text, embedded_paths, folder_paths
+from turbnet.data.text import fonts as matplotlib_fonts
+from turbnet.data.text import fonts_in
 from turbnet.data.text_scenes import TextScenes
 from turbnet.errors import InputError, ParameterError, check_range
 
@@ -28,6 +30,7 @@ class ClipData(L.LightningDataModule):
         val_folders: the same for validation.
         text: fraction of clips with rendered text: half of them scenes of it, half filled with it.
         moving: fraction of clips with something that moves.
+        fonts: folders of fonts to write training text with, besides those that come with matplotlib; validation uses these.
         scales: range of the factor by which pictures are reduced before cropping.
         val_clips: clips to validate on, always the same.
         curriculum: training steps over which strength rises from a quarter of its range to all of it.
@@ -51,6 +54,7 @@ class ClipData(L.LightningDataModule):
         folders: Sequence[str] = (),
         val_folders: Sequence[str] = (),
         text: float = 0.25,
+        fonts: Sequence[str] = (),
         moving: float = 0.25,
         scales: Sequence[float] = (0.5, 1.0),
         val_clips: int = 8,
@@ -66,16 +70,18 @@ class ClipData(L.LightningDataModule):
         check_range("text", text, 0, 1)
         if len(scales) != 2 or not 0 < scales[0] <= scales[1] <= 1:
             raise ParameterError(f"scales = {list(scales)} must be a range: two numbers, 0 < low <= high <= 1")
-        for name, paths in (("folders", folders), ("val_folders", val_folders)):
+        for name, paths in (("folders", folders), ("val_folders", val_folders), ("fonts", fonts)):
             if isinstance(paths, str):
                 raise InputError(f"{name} = {paths!r} must be a list, such as [{paths}]")
         self.batch_size, self.workers = batch_size, workers
         ranges = (float(scales[0]), float(scales[1]))
 
-        def source(paths: Sequence[Path | PackedPicture]) -> Source:
-            return Mixture([Pictures(paths, ranges), TextScenes(), Text()], [1 - text, text / 2, text / 2])
+        def source(paths: Sequence[Path | PackedPicture], more: Sequence[Path] = ()) -> Source:
+            written = (*matplotlib_fonts(), *more)
+            parts = (Pictures(paths, ranges), TextScenes(font_paths=written), Text(written))
+            return Mixture(parts, (1 - text, text / 2, text / 2))
 
-        train = source(folder_paths(folders) if folders else embedded_paths("train"))
+        train = source(folder_paths(folders) if folders else embedded_paths("train"), fonts_in(fonts))
         val = source(folder_paths(val_folders) if val_folders else embedded_paths("test"))
         self.curriculum, self.simulator, self.drawn = curriculum, simulator, drawn
         if drawn and (simulator is None or simulator.get("model", "zernike") != "zernike"):

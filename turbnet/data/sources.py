@@ -113,10 +113,17 @@ class Pictures:
 
 
 class Text:
-    """Rendered text; see `turbnet.data.text`."""
+    """Rendered text; see `turbnet.data.text`.
+
+    Args:
+        font_paths: to choose from; None: those that come with matplotlib.
+    """
+
+    def __init__(self, font_paths: Sequence[Path] | None = None) -> None:
+        self.font_paths = font_paths
 
     def __call__(self, rng: np.random.Generator, height: int, width: int) -> Picture:
-        return render_text(rng, height, width)
+        return render_text(rng, height, width, self.font_paths)
 
 
 class Mixture:

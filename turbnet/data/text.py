@@ -1,6 +1,7 @@
-"""Rendered text: words and lines in fonts that matplotlib ships, as scenes to train on."""
+"""Rendered text: words and lines, as scenes to train on, in fonts that matplotlib ships or in others."""
 
 import string
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+
+from turbnet.errors import InputError
 
 _CHARACTERS = string.ascii_uppercase + string.ascii_lowercase + string.digits
 # Of syllables: how they begin, their vowels as often as they occur, how they end, if they do.
@@ -31,9 +34,45 @@ def fonts() -> tuple[Path, ...]:
     return tuple(sorted(path for name in names for path in folder.glob(name) if "Display" not in path.name))
 
 
-@lru_cache(maxsize=256)
-def _font(path: Path, size: int) -> ImageFont.FreeTypeFont:
-    return ImageFont.truetype(str(path), size)
+def fonts_in(folders: Sequence[str | Path] | None = None) -> tuple[Path, ...]:
+    """Fonts below the folders that have every letter and digit, sorted; None: of this machine, and another has others.
+
+    Raises:
+        InputError: a folder that does not exist or holds no such font.
+    """
+    from matplotlib.font_manager import findSystemFonts
+
+    if folders is None:
+        return tuple(path for path in sorted(map(Path, findSystemFonts())) if _is_complete(path))
+    found: list[Path] = []
+    for folder in map(Path, folders):
+        here = [path for path in sorted(map(Path, findSystemFonts([str(folder)]))) if _is_complete(path)]
+        if not here:
+            raise InputError(f"no fonts in {folder}" if folder.is_dir() else f"there is no folder {folder}")
+        found += here
+    return tuple(found)
+
+
+def _is_complete(path: Path) -> bool:
+    from matplotlib.ft2font import FT2Font
+
+    try:
+        return {ord(character) for character in _CHARACTERS} <= set(FT2Font(str(path)).get_charmap())
+    except (RuntimeError, OSError):
+        return False
+
+
+@lru_cache(maxsize=512)
+def load_font(path: Path, size: float) -> ImageFont.FreeTypeFont:
+    """A font at `size` pixels an em.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        return ImageFont.truetype(str(path), size)
+    except OSError as error:
+        raise InputError(f"{path} is no font that can be read: {error}") from error
 
 
 def random_word(rng: np.random.Generator) -> str:
@@ -51,14 +90,20 @@ def random_word(rng: np.random.Generator) -> str:
     return [word, word.upper(), word.lower(), word.capitalize()][rng.integers(4)]
 
 
-def render_text(rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
+def render_text(
+    rng: np.random.Generator, height: int, width: int, font_paths: Sequence[Path] | None = None
+) -> NDArray[np.float32]:
     """A picture (height, width, 3), sRGB in [0, 1], of lines of random words of one font, size and contrast.
 
     Half of the pictures are filled with words and half have wide gaps, half are straight and half turned by up to `TURN`
     degrees, and the light on the paper falls off towards one side.
+
+    Args:
+        font_paths: to choose from; None: those that come with matplotlib.
     """
     size = int(rng.integers(10, 41))
-    font = _font(fonts()[rng.integers(len(fonts()))], size)
+    paths = fonts() if font_paths is None else font_paths
+    font = load_font(paths[int(rng.integers(len(paths)))], size)
     paper, ink = _colours(rng)
     turn = rng.uniform(-TURN, TURN) if rng.random() < 0.5 else 0.0
     gap = size * (0.5 if rng.random() < 0.5 else rng.uniform(0.5, 4))

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from turbnet.atmosphere.noll import noll_covariance, noll_matrix
-from turbnet.data.text_scenes import load_font
+from turbnet.data.text import load_font
 from turbnet.data.words import ALPHABET, WORDS
 from turbnet.simulate.draw import TILT_PIXELS
 from turbnet.simulate.psf_basis import kernel_size, tilt_free_psf

@@ -11,17 +11,17 @@ ink, carried the same way. Ink and paper are `contrast` of full scale apart, in 
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from turbnet.data.boxes import TextBox
-from turbnet.data.text import fonts
+from turbnet.data.text import fonts, load_font
 from turbnet.data.words import WORDS
-from turbnet.errors import InputError, ParameterError, check_range
+from turbnet.errors import ParameterError, check_range
 
 KINDS = ("words", "lines", "plates", "ladder")
 """words: one word a box, one size. lines: several words a box. plates: capitals and digits on a plate of their own.
@@ -108,33 +108,6 @@ class TextScenes:
 
     def __call__(self, rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
         return self._scene(rng, height, width).picture
-
-
-def system_fonts() -> tuple[Path, ...]:
-    """Fonts of this machine that have every letter and digit, sorted; another machine has others."""
-    from matplotlib.font_manager import findSystemFonts
-    from matplotlib.ft2font import FT2Font
-
-    def complete(path: str) -> bool:
-        try:
-            return {ord(character) for character in string.ascii_letters + _DIGITS} <= set(FT2Font(path).get_charmap())
-        except (RuntimeError, OSError):
-            return False
-
-    return tuple(Path(path) for path in sorted(findSystemFonts()) if complete(path))
-
-
-@lru_cache(maxsize=512)
-def load_font(path: Path, size: float) -> ImageFont.FreeTypeFont:
-    """A font at `size` pixels an em.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    try:
-        return ImageFont.truetype(str(path), size)
-    except OSError as error:
-        raise InputError(f"{path} is no font that can be read: {error}") from error
 
 
 def plate_text(rng: np.random.Generator) -> str:

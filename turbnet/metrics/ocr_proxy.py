@@ -29,8 +29,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from turbnet.data.boxes import TextBox
-from turbnet.data.text import fonts
-from turbnet.data.text_scenes import load_font
+from turbnet.data.text import fonts, load_font
 from turbnet.errors import InputError
 from turbnet.metrics.text import Picture, TextScore, normalise
 
