@@ -128,7 +128,9 @@ def broken_off(model, tmp_path) -> Path:
 
 def test_other_settings_or_another_source_are_refused(model, broken_off):
     source, target = broken_off / "in.mkv", broken_off / "out.mkv"
-    for settings, says in (({"passes": 2}, "passes"), ({"window": 5}, "window"), ({"crop": (0, 0, 40, 40)}, "crop")):
+    others = ({"passes": 2}, {"views": 2}, {"window": 5}, {"crop": (0, 0, 40, 40)})
+    for settings in others:
+        (says,) = settings
         with pytest.raises(InputError, match=f"its {says} differs"):
             restore_clip(source, target, Model.load(model, 1), resume=True, **settings)
     os.utime(source, ns=(0, 0))

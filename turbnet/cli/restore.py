@@ -37,6 +37,9 @@ def restore(
     crop: Annotated[str | None, typer.Option(metavar="L,T,W,H", help="part of the frame to restore, pixels")] = None,
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
     passes: Annotated[int, typer.Option(help="how often; a second pass for blur stronger than one can undo")] = 1,
+    views: Annotated[
+        int, typer.Option(help="1 to 8: the clip turned and mirrored as well, and averaged; so much slower")
+    ] = 1,
     skip: Annotated[
         bool, typer.Option("--skip/--no-skip", help="leave out what needs no restoration or has not changed")
     ] = False,
@@ -75,6 +78,7 @@ def restore(
             tile=tile,
             window=window,
             passes=passes,
+            views=views,
             skip=skip,
             maps=Model.load(released_maps(), threads) if skip and released_maps().is_file() else None,
             resume=resume,

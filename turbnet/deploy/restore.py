@@ -19,6 +19,7 @@ from turbnet.deploy.sidecar import Sidecar, identity
 from turbnet.deploy.skipping import Skipped, Skipping
 from turbnet.deploy.stream import stream, window_count
 from turbnet.deploy.tiling import Tiling, packed
+from turbnet.deploy.views import MOST, Views
 from turbnet.errors import InputError, check_range
 from turbnet.media.clip import open_clip, open_writer
 from turbnet.media.live import STANDARD, is_live
@@ -116,23 +117,36 @@ class FrameByFrame:
         return restored_BTCHW
 
 
-Ready = Model | ClassicalMethod | FrameByFrame | Skipping
+Ready = Model | ClassicalMethod | FrameByFrame | Skipping | Views
 
 
 def ready(
-    model: Model | ClassicalMethod, tiles: int, skipped: Skipped | None = None, maps: Model | None = None
+    model: Model | ClassicalMethod,
+    tiles: int,
+    skipped: Skipped | None = None,
+    maps: Model | None = None,
+    views: int = 1,
 ) -> Ready:
     """What `restore_frames` takes for one pass over a clip of so many tiles a frame; what is carried starts from nothing.
 
     Args:
         skipped: counts what a model that takes whole windows is spared; None: it is spared nothing.
         maps: says of single frames what needs nothing.
+        views: of every window, see `turbnet.deploy.views`.
+
+    Raises:
+        InputError: several views of what does not take whole windows through a network.
     """
+    if views != 1 and (isinstance(model, ClassicalMethod) or model.card.carried):
+        raise InputError(
+            f"views = {views}: a method without learning and a model that goes frame by frame have one view"
+        )
     if isinstance(model, ClassicalMethod):
         return model
     if model.card.carried:
         return FrameByFrame(model, tiles)
-    return model if skipped is None else Skipping(model, tiles, skipped, model.card.size_multiple, maps)
+    network = model if views == 1 else Views(model, views)
+    return network if skipped is None else Skipping(network, tiles, skipped, model.card.size_multiple, maps)
 
 
 def tiling_of(model: Model | ClassicalMethod, tile: int = TILE, overlap: int | None = None) -> Tiling:
@@ -156,10 +170,11 @@ def restore_array(
     model: Model | ClassicalMethod,
     skipped: Skipped | None = None,
     window: int | None = None,
+    views: int = 1,
 ) -> np.ndarray:
-    """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would; `skipped` as in `ready`."""
+    """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would; see `ready`."""
     tiling = tiling_of(model)
-    network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped)
+    network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped, views=views)
     return np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model, window))))
 
 
@@ -178,6 +193,7 @@ def restore_clip(
     overlap: int | None = None,
     window: int | None = None,
     passes: int = 1,
+    views: int = 1,
     skip: bool = False,
     maps: Model | None = None,
     resume: bool = False,
@@ -194,6 +210,7 @@ def restore_clip(
         overlap: of neighbouring tiles, pixels; None: 32, or a quarter of a tile smaller than 128.
         window: frames restored together; None: what the model's card recommends, 50 for a classical method.
         passes: how often; a second pass restores what the first one left, for blur stronger than a network can undo at once.
+        views: of every window: so many times a network restores it, turned and mirrored, see `turbnet.deploy.views`.
         skip: spare a model the tiles that need nothing, see `turbnet.deploy.skipping`.
         maps: with `skip`, the network that says what single frames need.
         resume: keep restored frames beside the destination until it is whole, and go on with those that are there, see
@@ -206,6 +223,7 @@ def restore_clip(
     """
     tiling, window = tiling_of(model, tile, overlap), window_of(model, window)
     passes = int(check_range("passes", passes, 1, 8))
+    views = int(check_range("views", views, 1, MOST))
     step = window - window_overlap(window)
     count, inside, start, skipped = 0, 0.0, perf_counter(), Skipped()
     with ExitStack() as stack:
@@ -223,6 +241,7 @@ def restore_clip(
                 "overlap of tiles": tiling.overlap,
                 "window": window,
                 "passes": passes,
+                "views": views,
             }
             sidecar = stack.enter_context(Sidecar(Path(destination), settings, step, info.grey))
         sound = stack.enter_context(clip.sound())
@@ -266,7 +285,7 @@ def restore_clip(
                 count += 1
             frames = chain(held, frames)
         for first, following in pairwise(starts):
-            whole = ready(model, tiles, skipped if skip else None, maps)
+            whole = ready(model, tiles, skipped if skip else None, maps, views)
             restored = restore_frames(frames, partial(timed, whole=whole), tiling, window)
             frames = islice(restored, following - first, None)
         if sidecar:

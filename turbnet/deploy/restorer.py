@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from turbnet.deploy.restore import TILE, Restoration, ready, restore_clip, restore_frames, tiling_of, window_of
 from turbnet.deploy.session import Model
+from turbnet.deploy.views import MOST
 from turbnet.deploy.weights import DEFAULT, find_model
-from turbnet.errors import InputError
+from turbnet.errors import InputError, check_range
 
 
 class Restorer:
@@ -27,15 +28,21 @@ class Restorer:
         threads: processor threads of one call; None: all cores.
         window: frames restored together; None: as the network's card recommends.
         tile: greatest side of a tile, pixels.
+        views: of every window, 1 to 8: restored so many times, turned and mirrored, and averaged.
 
     Raises:
         InputError: there is no such model, it is damaged, a value out of range.
     """
 
     def __init__(
-        self, model: str | Path = DEFAULT, threads: int | None = None, window: int | None = None, tile: int = TILE
+        self,
+        model: str | Path = DEFAULT,
+        threads: int | None = None,
+        window: int | None = None,
+        tile: int = TILE,
+        views: int = 1,
     ) -> None:
-        self.model = Model.load(find_model(model), threads)
+        self.model, self.views = Model.load(find_model(model), threads), int(check_range("views", views, 1, MOST))
         self.window, self.tiling = window_of(self.model, window), tiling_of(self.model, tile)
 
     def __call__(self, frames_THWC: NDArray[Any]) -> NDArray[Any]:
@@ -68,7 +75,7 @@ class Restorer:
         first = next(source, None)
         if first is None:
             return
-        network = ready(self.model, self.tiling.count(*first.shape[:2]))
+        network = ready(self.model, self.tiling.count(*first.shape[:2]), views=self.views)
         for restored in restore_frames(chain([first], source), network, self.tiling, self.window):
             assert dtype is not None
             full = _full_scale(dtype)
@@ -85,6 +92,7 @@ class Restorer:
             tile=self.tiling.tile,
             window=self.window,
             passes=passes,
+            views=self.views,
             skip=skip,
             resume=resume,
         )
