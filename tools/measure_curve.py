@@ -1,14 +1,15 @@
 """Measure what `turbnet restore --quality` and `--budget-ms` choose from: turbnet/weights/curve.json.
 
-    python tools/measure_curve.py [--models xs s] [--windows 1 2 4 8 16 32]
+    python tools/measure_curve.py [--models xs s] [--windows 1 2 4 8 16 32] [--views 2 4 8]
 
-Every network and window on the benchmark's still scenes at D/r0 = 3, clips of 32 frames; the gain is over the input, the
-time the better of two runs on noise. A few minutes on a quiet machine.
+Every network and window on the benchmark's still scenes at D/r0 = 3, clips of 32 frames, with the largest window several
+views too; the gain is over the input, the time the better of two runs on noise. Ten minutes on a quiet machine.
 """
 
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--models", nargs="+", default=[name for name in ("xs", "s") if name in released_models()])
     parser.add_argument("--windows", nargs="+", type=int, default=[1, 2, 4, 8, 16, 32])
+    parser.add_argument("--views", nargs="+", type=int, default=[2, 4, 8])
     parser.add_argument("--output", type=Path, default=Path(__file__).parents[1] / "turbnet" / "weights" / CURVE)
     options = parser.parse_args()
     clips = [make_clip("static", scene, STRENGTH, FRAMES) for scene in range(SUITES["standard"].scenes)]
@@ -36,13 +38,14 @@ def main() -> int:
     points = []
     for name in options.models:
         model = Model.load(find_model(name))
-        for window in options.windows:
+        most = max(options.windows)
+        for window, views in [(window, 1) for window in options.windows] + [(most, views) for views in options.views]:
             scores = []
             for clip in clips:
-                out = restore_array(clip.frames, model, window=window)
+                out = restore_array(clip.frames, model, window=window, views=views)
                 scores.append(psnr(out, clip.target, BORDER).mean())
-            seconds = seconds_here(Setting(name, window, 0.0, 0.0))
-            point = {"model": name, "window": window, "gain": float(np.mean(scores) - before), "seconds": seconds}
+            seconds = seconds_here(Setting(name, window, 0.0, 0.0, views))
+            point = asdict(Setting(name, window, float(np.mean(scores) - before), seconds, views))
             points.append({key: round(value, 4) if isinstance(value, float) else value for key, value in point.items()})
             print(points[-1], flush=True)
     with atomic_path(options.output) as temporary:

@@ -59,6 +59,7 @@ def test_this_machine_takes_some_time():
         (["--quality", "99"], "the most is 6.0 dB"),
         (["--quality", "1", "--budget-ms", "5"], "not both"),
         (["--quality", "1", "--model", "s"], "leave --model"),
+        (["--quality", "1", "--views", "2"], "leave --model"),
         (["--budget-ms", "1e-6"], "at the least"),
     ],
 )
@@ -76,3 +77,16 @@ def test_the_command_line_restores_as_chosen(tmp_path):
     assert run([*command, "--json", str(report)]) == 0
     rows = {row["name"]: row["value"] for row in json.loads(report.read_text())["rows"]}
     assert rows["window"] == 1
+
+
+def test_views_are_chosen_too(tmp_path, monkeypatch):
+    """The best point restores every window twice: once transposed."""
+    monkeypatch.setattr(budget, "curve", lambda: [*POINTS, Setting("s", 32, 7.0, 8.0, views=2)])
+    assert budget.for_quality(6.5).views == 2
+    assert budget.for_budget(1e6, 64, 64, measure=lambda point, threads: 1.0).views == 2
+    write_clip(tmp_path / "in.tiff", np.random.default_rng(0).random((2, 32, 32, 3), dtype=np.float32))
+    for name, options in (("chosen", ["--quality", "6.5"]), ("given", ["--views", "2", "--window", "32"])):
+        assert (
+            run(["restore", str(tmp_path / "in.tiff"), "-o", str(tmp_path / f"{name}.tiff"), *options, "--quiet"]) == 0
+        )
+    assert (tmp_path / "chosen.tiff").read_bytes() == (tmp_path / "given.tiff").read_bytes()

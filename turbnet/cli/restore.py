@@ -29,7 +29,8 @@ def restore(
         str | None, typer.Option(metavar="NAME", help="a method without learning in place of a model: pipeline, ...")
     ] = None,
     budget_ms: Annotated[
-        float | None, typer.Option("--budget-ms", metavar="MS", help="the best network and window for so long a frame")
+        float | None,
+        typer.Option("--budget-ms", metavar="MS", help="the best network, window, views for so long a frame"),
     ] = None,
     quality: Annotated[
         float | None, typer.Option(metavar="DB", help="the cheapest ones that gain so much on the benchmark")
@@ -38,8 +39,8 @@ def restore(
     window: Annotated[int | None, typer.Option(help="frames restored together; default: as the model asks")] = None,
     passes: Annotated[int, typer.Option(help="how often; a second pass for blur stronger than one can undo")] = 1,
     views: Annotated[
-        int, typer.Option(help="1 to 8: the clip turned and mirrored as well, and averaged; so much slower")
-    ] = 1,
+        int | None, typer.Option(help="1 to 8: the clip turned and mirrored as well, and averaged; so much slower")
+    ] = None,
     skip: Annotated[
         bool, typer.Option("--skip/--no-skip", help="leave out what needs no restoration or has not changed")
     ] = False,
@@ -67,7 +68,7 @@ def restore(
     if json:
         check_output(json)
     if budget_ms is not None or quality is not None:
-        model, window = _chosen(source, crop, budget_ms, quality, threads, fixed=(model, method, window))
+        model, window, views = _chosen(source, crop, budget_ms, quality, threads, (model, method, window, views))
     network = ClassicalMethod(method, threads) if method else Model.load(find_model(model or DEFAULT), threads)
     with _ended_by_interrupt() if is_live(source) else nullcontext(lambda: False) as ended:
         done = restore_clip(
@@ -78,7 +79,7 @@ def restore(
             tile=tile,
             window=window,
             passes=passes,
-            views=views,
+            views=1 if views is None else views,
             skip=skip,
             maps=Model.load(released_maps(), threads) if skip and released_maps().is_file() else None,
             resume=resume,
@@ -118,8 +119,8 @@ def _chosen(
     quality: float | None,
     threads: int | None,
     fixed: tuple[object, ...],
-) -> tuple[str, int]:
-    """Network and window for a time or a quality."""
+) -> tuple[str, int, int]:
+    """Network, window and views for a time or a quality."""
     from turbnet.cli.options import parse_crop
     from turbnet.deploy.budget import for_budget, for_quality
     from turbnet.errors import InputError
@@ -129,7 +130,7 @@ def _chosen(
     if budget_ms is not None and quality is not None:
         raise InputError("give --budget-ms or --quality, not both")
     if any(value is not None for value in fixed):
-        raise InputError("--budget-ms and --quality choose model and window: leave --model, --method and --window out")
+        raise InputError("--budget-ms and --quality choose the rest: leave --model, --method, --window and --views out")
     if quality is not None:
         point = for_quality(quality)
     elif budget_ms is not None:
@@ -137,7 +138,7 @@ def _chosen(
             raise InputError("--budget-ms needs to know the size of the frames beforehand: not of a pipe or a camera")
         with open_clip(source, parse_crop(crop)) as clip:
             point = for_budget(budget_ms, clip.info.height, clip.info.width, threads)
-    return point.model, point.window
+    return point.model, point.window, point.views
 
 
 @contextmanager

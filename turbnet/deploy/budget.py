@@ -1,8 +1,8 @@
-"""Which network and window to restore with, for a time or for a quality: points of a measured curve.
+"""Which network, window and views to restore with, for a time or for a quality: points of a measured curve.
 
-`turbnet/weights/curve.json` (tools/measure_curve.py writes it) holds, for each released network and several windows, the
-gain in PSNR over the input on the benchmark's still scenes at D/r0 = 3, and the time a million pixels of one frame took. How
-much faster or slower a machine is, one run of the cheapest point tells.
+`turbnet/weights/curve.json` (tools/measure_curve.py writes it) holds, for each released network, several windows and views,
+the gain in PSNR over the input on the benchmark's still scenes at D/r0 = 3, and the time a million pixels of one frame took.
+How much faster or slower a machine is, one run of the cheapest point tells.
 """
 
 import json
@@ -15,6 +15,7 @@ import numpy as np
 
 from turbnet.deploy.restore import tiling_of, window_overlap
 from turbnet.deploy.session import Model
+from turbnet.deploy.views import Views
 from turbnet.deploy.weights import find_model
 from turbnet.errors import InputError, check_range
 
@@ -31,12 +32,14 @@ class Setting:
         window: frames restored together.
         gain: over the input, dB.
         seconds: of a million pixels of one frame, where it was measured.
+        views: of every window, see `turbnet.deploy.views`.
     """
 
     model: str
     window: int
     gain: float
     seconds: float
+    views: int = 1
 
 
 def curve() -> list[Setting]:
@@ -97,12 +100,12 @@ def for_budget(
 
 def seconds_here(point: Setting, threads: int | None = None) -> float:
     """What a million pixels of one frame take on this machine, s: the better of two runs after a first."""
-    model = Model.load(find_model(point.model), threads)
+    network = Views(Model.load(find_model(point.model), threads), point.views)
     frames = np.random.default_rng(0).random((1, point.window, 3, _PROBE, _PROBE), dtype=np.float32)
     times = []
     for _ in range(3):
         begun = time.perf_counter()
-        model(frames)
+        network(frames)
         times.append(time.perf_counter() - begun)
     # Windows share frames, which are restored more than once.
     own = point.window - window_overlap(point.window)
