@@ -19,7 +19,7 @@ from turbnet.bench.deployment import BORDER, restored, through_air
 from turbnet.cli.options import parse_crop
 from turbnet.deploy.restore import window_of, window_overlap
 from turbnet.deploy.session import Model
-from turbnet.deploy.skipping import Skipped, _around, _block_means
+from turbnet.deploy.skipping import Skipped, around, block_means
 from turbnet.deploy.weights import find_model
 from turbnet.media.clip import open_clip
 from turbnet.metrics.fidelity import psnr
@@ -62,18 +62,18 @@ def bound(clean_THW: np.ndarray, window: int, multiple: int, fitted: bool) -> tu
     sides = clean_THW.shape[1:]
     step = window - window_overlap(window)
     kept = clean_THW[: step + window].mean(0)
-    levels = _block_means(kept[None])[0].ravel()
+    levels = block_means(kept[None])[0].ravel()
     changes = []
     for frame in clean_THW:
         known = kept
         if fitted:
-            slope, level = _line(levels, _block_means(frame[None])[0].ravel())
+            slope, level = _line(levels, block_means(frame[None])[0].ravel())
             known = slope * kept + level
-        changes.append(_block_means((frame - known)[None] ** 2)[0])
+        changes.append(block_means((frame - known)[None] ** 2)[0])
     shares, missed = [1.0, 1.0], [0.0, 0.0]
     for first in range(2 * step, len(clean_THW) - window + 1, step):
         change = np.mean(changes[first : first + window], axis=0)
-        boxes = _around(change > _CHANGED, sides, multiple)
+        boxes = around(change > _CHANGED, sides, multiple)
         area = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
         shares.append(min(area / (sides[0] * sides[1]), 1.0))
         missed.append(float(np.where(change > _CHANGED, 0, change).mean()))

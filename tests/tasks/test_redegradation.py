@@ -6,6 +6,7 @@ import skimage.data
 import torch
 from omegaconf import OmegaConf
 
+from turbnet.classical.methods import METHODS
 from turbnet.data.footage import Footage, footage_paths
 from turbnet.data.pairs import PairMaker
 from turbnet.data.unlabelled import Fused, fused
@@ -157,7 +158,7 @@ def test_every_cut_comes_with_its_place_in_the_fused_picture(clips):
     """A fused picture of plain means tells: it is the mean of the cut where the cut is the whole clip's length."""
     paths = footage_paths([clips])
     cuts = Footage(paths, 6, 32, 32, seed=3)
-    data = Fused(cuts, {path: fused(path, "mean") for path in paths})
+    data = Fused(cuts, {path: fused(path, METHODS["mean"]) for path in paths})
     for index in range(6):
         cut = data[index]
         mean = to_srgb(to_linear(cut["scene"]).mean(0))
@@ -169,7 +170,7 @@ def test_a_fused_picture_is_nearer_the_truth_than_a_frame(tmp_path):
     picture = torch.from_numpy(skimage.data.astronaut()[20:84, 180:244].copy()).float().permute(2, 0, 1) / 255
     pair = maker(picture.expand(1, 10, 3, 64, 64), [5])
     write_clip(tmp_path / "clip.mkv", pair.frames[0].permute(0, 2, 3, 1).numpy())
-    still = fused(tmp_path / "clip.mkv", "pipeline")
+    still = fused(tmp_path / "clip.mkv", METHODS["pipeline"])
     inside = np.s_[..., 8:-8, 8:-8]
     errors = [((x - pair.target[0, 0])[inside] ** 2).mean() for x in (still, pair.frames[0])]
     assert errors[0] < 0.4 * errors[1]
@@ -180,7 +181,7 @@ def test_of_a_long_clip_some_frames_are_fused(tmp_path):
     ramp = np.linspace(0, 1, 120, dtype=np.float32)[:, None, None, None] * np.ones((1, 16, 16, 3), np.float32)
     write_clip(tmp_path / "ramp.mkv", ramp)
     expected = to_srgb(torch.from_numpy(to_linear(ramp[:, 0, 0, 0])).mean())
-    assert abs(float(fused(tmp_path / "ramp.mkv", "mean").mean()) - float(expected)) < 0.01
+    assert abs(float(fused(tmp_path / "ramp.mkv", METHODS["mean"]).mean()) - float(expected)) < 0.01
 
 
 def test_clips_that_cannot_be_used(run, clips, tmp_path):

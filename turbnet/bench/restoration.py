@@ -67,14 +67,13 @@ def entrants(methods: Sequence[str], models: Sequence[str], commands: Sequence[s
     Raises:
         InputError: an unknown method or model, a command without {in} or {out}.
     """
-    from turbnet.classical.methods import METHODS
+    from turbnet.classical.methods import METHODS, find_method
     from turbnet.deploy.weights import find_model, released_models
 
     if not methods and not models and not commands:
         methods, models = list(METHODS), list(released_models())
     for name in methods:
-        if name not in METHODS:
-            raise InputError(f"there is no method {name}; the methods are {', '.join(METHODS)}")
+        find_method(name)
     for name in models:
         find_model(name)
     for command in commands:

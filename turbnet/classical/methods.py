@@ -17,6 +17,7 @@ from turbnet.classical.pipeline import REDUCTION, restore
 from turbnet.classical.reference import low_rank_plus_sparse, non_local_means, still_variance, temporal_mean
 from turbnet.classical.registration import Flow, control_point_flow, optical_flow, register
 from turbnet.classical.sharpness import variance
+from turbnet.errors import InputError
 
 Report = Callable[[float], object]
 Method = Callable[[Array, int, Report], Array]
@@ -120,3 +121,14 @@ METHODS: dict[str, Method] = {
     "plug-and-play": _deconvolved_by(_plug_and_play),
 }
 """By name; `pipeline` is the default one."""
+
+
+def find_method(name: str) -> Method:
+    """The method of this name.
+
+    Raises:
+        InputError: there is none; lists those there are.
+    """
+    if name not in METHODS:
+        raise InputError(f"there is no method {name}; the methods are {', '.join(METHODS)}")
+    return METHODS[name]

@@ -10,7 +10,7 @@ from lightning.pytorch.utilities import CombinedLoader
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from turbnet.classical.methods import METHODS
+from turbnet.classical.methods import Method, find_method
 from turbnet.data.footage import Footage, footage_paths
 from turbnet.data.module import ClipData
 from turbnet.errors import InputError, check_range
@@ -21,19 +21,17 @@ FUSED = 50
 """Frames of a clip that are fused, equally spaced where it has more."""
 
 
-def fused(path: Path, method: str) -> Tensor:
+def fused(path: Path, method: Method) -> Tensor:
     """What a classical method makes of a clip of a still scene, (3, H, W), sRGB: the mean of its frames.
 
     Raises:
-        InputError: there is no such method, the clip cannot be read.
+        InputError: the clip cannot be read.
     """
-    if method not in METHODS:
-        raise InputError(f"there is no method {method}; the methods are {', '.join(METHODS)}")
     with open_clip(path) as clip:
         count = clip.info.frames or sum(1 for _ in clip)
         chosen = set(np.linspace(0, count - 1, min(count, FUSED)).round().astype(int).tolist())
         frames = np.stack([to_linear(frame.clip(0, 1)) for index, frame in enumerate(clip) if index in chosen])
-    clear = METHODS[method](frames, torch.get_num_threads(), lambda share: None).mean(0)
+    clear = method(frames, torch.get_num_threads(), lambda share: None).mean(0)
     return torch.from_numpy(to_srgb(clear.clip(0, 1)).astype(np.float32)).permute(2, 0, 1)
 
 
@@ -75,7 +73,7 @@ class UnlabelledData(ClipData):
         more: see `ClipData`; `size`, `batch_size` and `seed` are those of the cuts as well.
 
     Raises:
-        InputError: no clips, clips that are too short or small, and as `ClipData`.
+        InputError: no such method, no clips, clips that are too short or small, and as `ClipData`.
     """
 
     def __init__(self, clips: Sequence[str], clip_frames: int = 6, fuse: str = "pipeline", **more: Any) -> None:
@@ -87,7 +85,7 @@ class UnlabelledData(ClipData):
         self.cuts = Footage(paths, clip_frames, size, size, self.train.seed)
         # Another seed than training's, and the same whatever training's is.
         self.val_cuts = Footage(paths, clip_frames, size, size, 2**31 - 1)
-        self._fuse, self._pictures = fuse, dict[Path, Tensor]()
+        self._fuse, self._pictures = find_method(fuse), dict[Path, Tensor]()
 
     def train_dataloader(self) -> Any:
         """Fresh cuts and scenes every epoch."""

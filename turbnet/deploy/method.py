@@ -6,7 +6,7 @@ import numpy as np
 
 from turbnet.deploy.card import ModelCard
 from turbnet.deploy.session import available_cores
-from turbnet.errors import InputError, check_range
+from turbnet.errors import check_range
 from turbnet.media.colour import to_linear, to_srgb
 
 WINDOW = 50
@@ -25,11 +25,9 @@ class ClassicalMethod:
     """
 
     def __init__(self, name: str, threads: int | None = None) -> None:
-        from turbnet.classical.methods import METHODS  # torch, which networks do without
+        from turbnet.classical.methods import find_method  # torch, which networks do without
 
-        if name not in METHODS:
-            raise InputError(f"there is no method {name}; the methods are {', '.join(METHODS)}")
-        self._restore = METHODS[name]
+        self._restore = find_method(name)
         threads = available_cores() if threads is None else threads
         self.threads = int(check_range("threads", threads, 1, 1024))
         self.card = ModelCard(architecture=name, config={}, size_multiple=1, frames=WINDOW)

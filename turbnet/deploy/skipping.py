@@ -114,7 +114,7 @@ class Skipping:
         moved = min(moved, kept.dance) if kept else moved
         means, spread = _blocks(grey)
         # Only what stands still all the time stands for what comes; air moves the slopes of a picture as far as it dances.
-        slopes = _block_means(np.hypot(*np.gradient(grey.mean(0)))[None])[0]
+        slopes = block_means(np.hypot(*np.gradient(grey.mean(0)))[None])[0]
         calm = spread < _CHANGE + _SLOPES * moved * np.minimum(slopes, 1 / _BLOCK)
         steady = calm & _same(means.mean(0), np.inf, spread, means)
         known, windows = np.zeros_like(calm), np.zeros(calm.shape)
@@ -122,7 +122,7 @@ class Skipping:
         if kept is not None:
             known = calm & kept.steady & _same(kept.means, len(means), np.minimum(kept.spread, spread), means)
             windows = np.where(known, kept.windows, 0)
-            boxes = _around(windows < ENOUGH, sides, self._multiple)
+            boxes = around(windows < ENOUGH, sides, self._multiple)
         share = sum((down.stop - down.start) * (across.stop - across.start) for down, across in boxes)
         share = float(min(share / (sides[0] * sides[1]), 1.0))
         self.skipped.restored += share
@@ -155,7 +155,7 @@ class Skipping:
         return out
 
 
-def _around(changed_hw: np.ndarray, sides: tuple[int, int], multiple: int) -> list[tuple[slice, slice]]:
+def around(changed_hw: np.ndarray, sides: tuple[int, int], multiple: int) -> list[tuple[slice, slice]]:
     """Rectangles around the blocks that have changed and what surrounds them, as large as a network takes them."""
     found: list[tuple[int, int, int, int]] = []
     ends = [[*_starts(side)[1:], side] for side in sides]
@@ -233,11 +233,12 @@ def _blocks(frames_THW: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     The standard deviation, from the median difference of successive frames: what comes and goes makes a few of them large.
     """
-    means = _block_means(frames_THW)
+    means = block_means(frames_THW)
     return means, np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.954
 
 
-def _block_means(pictures_NHW: np.ndarray) -> np.ndarray:
+def block_means(pictures_NHW: np.ndarray) -> np.ndarray:
+    """Means of the blocks of every picture, (N, h, w) float64; the last one of an axis takes what is left."""
     sums, count = pictures_NHW.astype(np.float64), np.ones(())
     for axis in (1, 2):
         starts = _starts(pictures_NHW.shape[axis])
