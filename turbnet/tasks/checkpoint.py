@@ -1,7 +1,8 @@
 """Networks out of checkpoints, without executing code."""
 
+import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,3 +78,31 @@ def load_net(path: str | Path, expect: Mapping[str, Any] | None = None) -> dict[
         raise InputError(f"{path} holds another network: {found!r:.500}, not {dict(expect)}")
     prefix = "net."
     return {key[len(prefix) :]: value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)}
+
+
+def mean_of(paths: Sequence[str | Path], weights: Sequence[float] | None = None) -> dict[str, Any]:
+    r"""A checkpoint of the mean of several networks' weights, :math:`\sum_k w_k \theta_k / \sum_k w_k`.
+
+    Trainings that began at the same weights end around a place that is often better than where any of them ended
+    (Wortsman et al., Model soups, ICML 2022); between a network and what it became by learning something else lie networks
+    that know of both. Of the optimiser nothing is kept; hyper-parameters are those of the last.
+
+    Args:
+        paths: checkpoints, or names of released networks, of one and the same network.
+        weights: w_k, not negative; None: all alike.
+
+    Raises:
+        InputError: a checkpoint cannot be used or holds another network; weights that make no mean.
+    """
+    shares = [1.0] * len(paths) if weights is None else list(weights)
+    if not paths or len(shares) != len(paths) or min(shares) < 0 or not 0 < sum(shares) < math.inf:
+        raise InputError(f"weights = {shares} of {len(paths)} networks: give one for each, not negative, not all 0")
+    last = read_checkpoint(paths[-1])
+    expected = last["hyper_parameters"]["net"]
+    mean: dict[str, Tensor] = {}
+    for path, share in zip(paths, shares, strict=True):
+        for name, value in load_net(path, expected).items():
+            part = value.double() * (share / sum(shares))
+            mean[name] = mean[name] + part if name in mean else part
+    kept = {f"net.{name}": value.to(last["state_dict"][f"net.{name}"].dtype) for name, value in mean.items()}
+    return {"state_dict": kept, "hyper_parameters": last["hyper_parameters"], "global_step": 0}
