@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from turbnet.deploy.method import ClassicalMethod
-from turbnet.deploy.restore import ready, restore_clip
+from turbnet.deploy.restore import restore_clip, views_of
 from turbnet.deploy.restorer import Restorer
 from turbnet.deploy.session import Model
 from turbnet.deploy.views import Views
@@ -71,4 +71,4 @@ def test_a_clip_of_several_views(model_file, tmp_path):
 
 def test_what_has_no_views(tmp_path):
     with pytest.raises(InputError, match="views = 2: a method without learning"):
-        ready(ClassicalMethod("mean"), 1, views=2)
+        views_of(ClassicalMethod("mean"), 2)

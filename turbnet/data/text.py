@@ -40,17 +40,21 @@ def fonts_in(folders: Sequence[str | Path] | None = None) -> tuple[Path, ...]:
     Raises:
         InputError: a folder that does not exist or holds no such font.
     """
-    from matplotlib.font_manager import findSystemFonts
-
     if folders is None:
-        return tuple(path for path in sorted(map(Path, findSystemFonts())) if _is_complete(path))
+        return _complete_fonts(None)
     found: list[Path] = []
     for folder in map(Path, folders):
-        here = [path for path in sorted(map(Path, findSystemFonts([str(folder)]))) if _is_complete(path)]
+        here = _complete_fonts([str(folder)])
         if not here:
             raise InputError(f"no fonts in {folder}" if folder.is_dir() else f"there is no folder {folder}")
         found += here
     return tuple(found)
+
+
+def _complete_fonts(folders: list[str] | None) -> tuple[Path, ...]:
+    from matplotlib.font_manager import findSystemFonts  # on a new machine it first looks at every font there is
+
+    return tuple(path for path in sorted(map(Path, findSystemFonts(folders))) if _is_complete(path))
 
 
 def _is_complete(path: Path) -> bool:

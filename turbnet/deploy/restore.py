@@ -132,15 +132,8 @@ def ready(
     Args:
         skipped: counts what a model that takes whole windows is spared; None: it is spared nothing.
         maps: says of single frames what needs nothing.
-        views: of every window, see `turbnet.deploy.views`.
-
-    Raises:
-        InputError: several views of what does not take whole windows through a network.
+        views: of every window through a model that takes whole windows: `views_of`.
     """
-    if views != 1 and (isinstance(model, ClassicalMethod) or model.card.carried):
-        raise InputError(
-            f"views = {views}: a method without learning and a model that goes frame by frame have one view"
-        )
     if isinstance(model, ClassicalMethod):
         return model
     if model.card.carried:
@@ -165,6 +158,19 @@ def window_of(model: Model | ClassicalMethod, window: int | None = None) -> int:
     return int(check_range("window", model.card.frames if window is None else window, 1, 1000, "frames"))
 
 
+def views_of(model: Model | ClassicalMethod, views: int = 1) -> int:
+    """Views of every window, see `turbnet.deploy.views`.
+
+    Raises:
+        InputError: out of range, or several of what does not take whole windows through a network.
+    """
+    if views != 1 and (isinstance(model, ClassicalMethod) or model.card.carried):
+        raise InputError(
+            f"views = {views}: a method without learning and a model that goes frame by frame have one view"
+        )
+    return int(check_range("views", views, 1, MOST))
+
+
 def restore_array(
     frames_THWC: np.ndarray,
     model: Model | ClassicalMethod,
@@ -174,7 +180,7 @@ def restore_array(
 ) -> np.ndarray:
     """A whole clip in memory, float32 (T, H, W, C) in [0, 1], as `turbnet restore` would; see `ready`."""
     tiling = tiling_of(model)
-    network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped, views=views)
+    network = ready(model, tiling.count(*frames_THWC.shape[1:3]), skipped, views=views_of(model, views))
     return np.stack(list(restore_frames(frames_THWC, network, tiling, window_of(model, window))))
 
 
@@ -223,7 +229,7 @@ def restore_clip(
     """
     tiling, window = tiling_of(model, tile, overlap), window_of(model, window)
     passes = int(check_range("passes", passes, 1, 8))
-    views = int(check_range("views", views, 1, MOST))
+    views = views_of(model, views)
     step = window - window_overlap(window)
     count, inside, start, skipped = 0, 0.0, perf_counter(), Skipped()
     with ExitStack() as stack:

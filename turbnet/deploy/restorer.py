@@ -13,11 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from turbnet.deploy.restore import TILE, Restoration, ready, restore_clip, restore_frames, tiling_of, window_of
+from turbnet.deploy.restore import (
+    TILE,
+    Restoration,
+    ready,
+    restore_clip,
+    restore_frames,
+    tiling_of,
+    views_of,
+    window_of,
+)
 from turbnet.deploy.session import Model
-from turbnet.deploy.views import MOST
 from turbnet.deploy.weights import DEFAULT, find_model
-from turbnet.errors import InputError, check_range
+from turbnet.errors import InputError
 
 
 class Restorer:
@@ -42,8 +50,9 @@ class Restorer:
         tile: int = TILE,
         views: int = 1,
     ) -> None:
-        self.model, self.views = Model.load(find_model(model), threads), int(check_range("views", views, 1, MOST))
+        self.model = Model.load(find_model(model), threads)
         self.window, self.tiling = window_of(self.model, window), tiling_of(self.model, tile)
+        self.views = views_of(self.model, views)
 
     def __call__(self, frames_THWC: NDArray[Any]) -> NDArray[Any]:
         """Restore a clip (T, H, W, 3) or a still (H, W, 3), RGB, sRGB-encoded; the same shape and dtype come back.

@@ -1,10 +1,10 @@
-"""A clip seen several ways: restored upright, turned and mirrored, and averaged.
+r"""A clip seen several ways: restored upright, turned and mirrored, and averaged.
 
-Air knows no up and down beyond a few metres, so a restoration of a turned or mirrored clip, turned back, is as good as that
-of the clip itself, and what a network gets wrong is in part another thing each time:
+The fluctuations of air that matter have no direction of their own, so a restoration of a turned or mirrored clip, turned
+back, is as good as that of the clip itself, and what a network gets wrong is in part another thing each time:
 
 .. math::
-    \\hat S = \\frac{1}{N} \\sum_{n=1}^{N} g_n^{-1} f(g_n I), \\qquad g_n \\in D_4
+    \hat S = \frac{1}{N} \sum_{n=1}^{N} g_n^{-1} f(g_n I), \qquad g_n \in D_4
 
 (Timofte et al., Seven ways to improve example-based single image super resolution, CVPR 2016). N times the work.
 """
