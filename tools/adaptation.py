@@ -1,10 +1,11 @@
 """Whether a restorer learns from clips without truth: trained on weak turbulence, fine-tuned on strong, measured on both.
 
-    python tools/adaptation.py --pictures FOLDER [--epochs 30] [--tuning 6] [--seeds 5] [--output outputs/adaptation]
+    python tools/adaptation.py --pictures FOLDER [--kind lens] [--epochs 30] [--tuning 6] [--seeds 5] [--output FOLDER]
 
-Trains `task=redegradation net=redegrading` at D/r0 = 1 to 2, then `task=finetune` on clips at D/r0 = 4 with more noise and a
-lens out of focus, simulated from pictures of the folder and kept as files without their truth, once for each seed. Clips of
-both kinds over the still scenes of the benchmark, which neither saw, then tell what was gained and what was lost.
+Trains `task=redegradation net=redegrading` at D/r0 = 1 to 2, then `task=finetune` on clips at D/r0 = 4 of a new kind, with
+more noise, a lens out of focus, a blur with tails or much more noise, simulated from pictures of the folder and kept as
+files without their truth, once for each seed. Clips of both kinds over the still scenes of the benchmark, which neither saw,
+then tell what was gained and what was lost.
 Resumable: what is trained is not trained again. Prints a table and keeps it in --output. With --real FOLDER it does the same
 with clips of its own: there is no truth, so the re-degradation error and the residual jitter are measured.
 """
@@ -34,7 +35,12 @@ from turbnet.tasks.checkpoint import load_net, read_checkpoint
 from turbnet.tasks.losses import charbonnier
 
 OLD = {"d_over_r0": [1.0, 2.0], "full_well": 20_000.0, "read_noise": [0.0, 0.02]}
-NEW = {"d_over_r0": 4.0, "full_well": 3_000.0, "read_noise": 0.03, "defocus": 1.0, "blurred": 1.0}
+NOISY = {"d_over_r0": 4.0, "full_well": 3_000.0, "read_noise": 0.03, "blurred": 1.0}
+KINDS = {
+    "lens": {**NOISY, "defocus": 1.0},
+    "tails": {**NOISY, "defocus": 2.5, "tails": 1.0},
+    "dark": {**NOISY, "full_well": 300.0, "read_noise": 0.06, "defocus": 1.0},
+}
 FRAMES, SCENES, BORDER = 16, 4, 8
 UNLABELLED = 16  # clips
 
@@ -45,6 +51,7 @@ def main() -> int:
     parser.add_argument(
         "--real", nargs="+", type=Path, help="folders of clips to fine-tune on in place of simulated ones"
     )
+    parser.add_argument("--kind", choices=KINDS, default="lens", help="of the clips without truth")
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
@@ -60,20 +67,20 @@ def main() -> int:
     first = trained(options, "trained", options.epochs, ["task=redegradation", "data.frames=4", *old])
     unlabelled = options.real or [simulate(options)]
     before = load(first)
-    clips = {name: list(scenes(where)) for name, where in (("old", OLD), ("new", NEW))}
+    clips = {name: list(scenes(where)) for name, where in (("old", OLD), ("new", KINDS[options.kind]))}
     rows = {"trained": measure(before, clips, options.real)}
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
         more += ["data.clip_frames=4", "task.learning_rate=1e-3", "task.agree_weight=3"]
-        tuned = trained(options, f"tuned-{seed}", options.tuning, [*more, f"seed={seed}"])
+        tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         print({name: round(value, 4) for name, value in rows[f"fine-tuned, seed {seed}"].items()}, flush=True)
     lines = ["| network | " + " | ".join(rows["trained"]) + " |", "|---" * (1 + len(rows["trained"])) + "|"]
     for name, row in rows.items():
         lines.append(f"| {name} | " + " | ".join(f"{v:.3f}" if v < 1 else f"{v:.2f}" for v in row.values()) + " |")
     print("\n".join(lines))
-    with atomic_path(options.output / "adaptation.json") as temporary:
+    with atomic_path(options.output / f"adaptation-{options.kind}.json") as temporary:
         temporary.write_text(json.dumps(rows, indent=2) + "\n")
     return 0
 
@@ -87,9 +94,9 @@ def trained(options: argparse.Namespace, name: str, epochs: int, arguments: list
 
 def simulate(options: argparse.Namespace) -> Path:
     """Clips of the new kind without their truth, as files."""
-    folder: Path = options.output / "clips"
+    folder: Path = options.output / f"clips-{options.kind}"
     pictures = Pictures(folder_paths(options.pictures))
-    maker = PairMaker(SIZE, SIZE, **NEW)
+    maker = PairMaker(SIZE, SIZE, **KINDS[options.kind])
     for number in range(UNLABELLED):
         path = folder / f"{number:02d}.mkv"
         if not path.is_file():

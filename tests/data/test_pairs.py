@@ -1,3 +1,6 @@
+import math
+from dataclasses import replace
+
 import pytest
 import skimage.data
 import torch
@@ -217,6 +220,37 @@ def test_defocus_is_a_gaussian_of_its_width():
     x = torch.arange(41.0) - 20
     assert float(seen.sum()) == pytest.approx(1, abs=1e-5)
     assert float((seen.sum(0) * x**2).sum()) == pytest.approx(2.5**2, rel=0.04)
+
+
+def test_a_blur_with_tails_has_the_width_and_the_tails():
+    """exp(-sqrt(3) r / sigma): the variance is sigma^2 along either axis (0.7 % of the light lies beyond four sigma)."""
+    point = torch.zeros(1, 1, 1, 61, 61)
+    point[..., 30, 30] = 1
+    tails, bell = (defocused(point, 2.5, tails=tails)[0, 0, 0] for tails in (True, False))
+    x = torch.arange(61.0) - 30
+    assert float(tails.sum()) == pytest.approx(1, abs=1e-5)
+    assert float((tails.sum(0) * x**2).sum()) == pytest.approx(2.5**2, rel=0.06)
+    assert float(tails[30, 37] / tails[30, 30]) == pytest.approx(math.exp(-math.sqrt(3) * 7 / 2.5), rel=1e-3)
+    assert tails[30, 30] > bell[30, 30]
+    assert tails[30, 38] > 1.5 * bell[30, 38] > 0
+
+
+def test_a_frame_smaller_than_its_blur():
+    frames = torch.rand(1, 2, 3, 6, 9)
+    seen = defocused(frames, 4.0, tails=True)
+    assert seen.shape == frames.shape
+    assert frames.min() < seen.min() < seen.max() < frames.max()
+    torch.testing.assert_close(defocused(torch.full_like(frames, 0.3), 4.0, tails=True), torch.full_like(frames, 0.3))
+
+
+def test_tails_are_drawn_last():
+    """Clips of ranges without them are what they were before these came."""
+    plain, with_tails = (PairMaker(16, 16, modes=6, components=2, blurred=0.5, tails=tails) for tails in (0.0, 0.4))
+    pairs = [(plain.conditions(seed), with_tails.conditions(seed)) for seed in range(200)]
+    assert all(replace(b, tails=a.tails) == a for a, b in pairs)
+    # Two fifths of 200: 3.5 deviations of sqrt(48).
+    assert sum(b.tails for _, b in pairs) == pytest.approx(80, abs=24)
+    assert not any(a.tails for a, _ in pairs)
 
 
 def test_hardness_narrows_the_range_of_strengths():

@@ -6,7 +6,15 @@ from kornia.filters import gaussian_blur2d
 
 from turbnet.errors import ParameterError
 from turbnet.media.colour import to_linear, to_srgb
-from turbnet.nets.deconvolution import Deconvolution, RichardsonLucy, _blurred, defocus_kernel, turbulence_kernel
+from turbnet.nets.deconvolution import (
+    Deconvolution,
+    RichardsonLucy,
+    _blurred,
+    defocus_kernel,
+    tails_kernel,
+    turbulence_kernel,
+)
+from turbnet.optics.psf import convolve, exponential_psf
 
 
 def scene() -> torch.Tensor:
@@ -37,7 +45,13 @@ def error(encoded: torch.Tensor, linear: torch.Tensor) -> float:
     return float((to_linear(encoded) - linear)[inner].square().mean())
 
 
-KERNELS = [turbulence_kernel(0.0), turbulence_kernel(2.0), turbulence_kernel(6.5), defocus_kernel(2.5)]
+KERNELS = [
+    turbulence_kernel(0.0),
+    turbulence_kernel(2.0),
+    turbulence_kernel(6.5),
+    defocus_kernel(2.5),
+    tails_kernel(3.5),
+]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -77,6 +91,17 @@ def test_it_brings_back_what_a_lens_out_of_focus_takes():
 
 
 @torch.no_grad()
+def test_of_a_blur_with_tails_its_kernel_makes_more_than_a_gaussian():
+    linear = scene()
+    around = F.pad(linear, (40, 40, 40, 40), mode="replicate")
+    seen = to_srgb(convolve(around, exponential_psf(3.5, 61).float())[..., 40:-40, 40:-40])
+    tails, bell = (
+        error(guesses(seen, kernel, steps=30), linear) for kernel in (tails_kernel(3.5), defocus_kernel(2.5))
+    )
+    assert tails < 0.5 * bell < 0.5 * error(seen, linear)
+
+
+@torch.no_grad()
 def test_the_kernel_of_the_true_strength_does_best():
     linear = scene()
     for strength in (2.0, 3.0, 4.5):
@@ -97,10 +122,10 @@ def test_a_flat_picture_stays(level):
 @torch.no_grad()
 @pytest.mark.parametrize("size", [(2, 2), (6, 64), (34, 20)])
 def test_any_even_size_and_every_value_in_range(size):
-    net = Deconvolution()
+    net = Deconvolution(tails=(3.5,))
     for picture in (torch.rand(2, 3, *size), torch.randint(0, 2, (2, 3, *size)).float()):
         found = net(picture)
-        assert found.shape == (2, 5, 3, *size)
+        assert found.shape == (2, 6, 3, *size)
         assert found.isfinite().all()
         assert found.min() >= 0
         assert found.max() <= 1
@@ -145,7 +170,15 @@ def test_the_work_is_done_in_float32():
     torch.testing.assert_close(inside, Deconvolution()(picture), rtol=0, atol=0)
 
 
+def test_it_is_built_where_tensors_have_no_values():
+    """As a checkpoint's network is, to compare shapes before anything is loaded."""
+    with torch.device("meta"):
+        assert Deconvolution(tails=(3.5,)).count == 6
+
+
 def test_values_out_of_range():
+    with pytest.raises(ParameterError, match="sigma"):
+        Deconvolution(tails=(-1.0,))
     with pytest.raises(ParameterError, match="size of a kernel"):
         turbulence_kernel(2.0, 64)
     with pytest.raises(ParameterError, match="size of a kernel"):

@@ -12,12 +12,13 @@ from turbnet.nets.dncnn import DnCNN
 from turbnet.nets.still import StillRestorer
 from turbnet.nets.uncertainty import LEAST, MOST, Maps, Uncertainty, UncertaintyNet, laplace_loss
 
+COMPLEX = {"name": "complex-unet", "widths": [2, 3, 4], "depths": [1, 1, 1]}
 SMALL = {"name": "still", "widths": [4, 6, 8], "depths": [1, 1, 1]}
 MAPS = {"widths": [4, 6, 8], "depths": [1, 1, 1], "dropout": 0.2}
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("config", [SMALL, {**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}])
+@pytest.mark.parametrize("config", [SMALL, {**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}, COMPLEX])
 @pytest.mark.parametrize(("batch", "frames", "height", "width"), [(1, 1, 8, 8), (2, 3, 24, 40)])
 def test_untrained_they_give_back_the_frames(config, batch, frames, height, width):
     clip = torch.rand(batch, frames, 3, height, width)
@@ -31,7 +32,7 @@ def test_every_frame_is_restored_by_itself(trained, config):
     torch.testing.assert_close(net(clip)[1:, 2:], net(clip[1:, 2:]), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("config", [SMALL, {**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}])
+@pytest.mark.parametrize("config", [SMALL, {**SMALL, "maps": MAPS}, {"name": "dncnn", "width": 4, "depth": 3}, COMPLEX])
 def test_every_weight_learns(trained, config):
     net = trained(config)
     net(torch.rand(1, 2, 3, 16, 16)).square().mean().backward()
@@ -111,7 +112,7 @@ def test_those_to_compare_with_cost_as_much():
 
     costs = {}
     with initialize_config_module("turbnet.configs", version_base="1.3"):
-        for name in ("still", "still_plain", "still_unet", "dncnn"):
+        for name in ("still", "still_plain", "still_unet", "still_complex", "dncnn"):
             net = build(compose("train", overrides=[f"net={name}"]).net).eval()
             with FlopCounterMode(display=False) as counter, torch.no_grad():
                 net(torch.zeros(1, 1, 3, 64, 64))

@@ -140,6 +140,20 @@ def test_convolution_agrees_with_the_sum(shape, kernel_size):
     torch.testing.assert_close(optics.convolve(image, kernel), expected)
 
 
+@pytest.mark.parametrize("sigma", [2.0, 3.5])
+def test_the_exponential_blur_has_its_width_and_its_transfer_function(sigma):
+    """H(f) = {1 + (2 pi a f)^2}^(-3/2), a = sigma / sqrt(3), folded at every whole cycle a pixel by the sampling."""
+    kernel = optics.exponential_psf(sigma, 129)
+    x = torch.arange(129, dtype=torch.float64) - 64
+    assert float(kernel.sum()) == pytest.approx(1, abs=1e-12)
+    assert float((kernel.sum(0) * x**2).sum()) == pytest.approx(sigma**2, rel=0.03)
+    f = torch.fft.fftfreq(129, dtype=torch.float64)
+    whole = torch.arange(-20.0, 21.0, dtype=torch.float64)
+    folded = (f[:, None, None] + whole[:, None]).square() + whole**2
+    wanted = (1 + (2 * math.pi * sigma / math.sqrt(3)) ** 2 * folded).pow(-1.5).sum((1, 2))
+    torch.testing.assert_close(optics.otf(kernel)[0].real, wanted / wanted[0], rtol=0, atol=1e-3)
+
+
 def test_gradients():
     small = torch.tensor(circular(6, 4))
     phase = torch.randn(2, 6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
@@ -154,6 +168,9 @@ def test_float32_stays_float32(pupil):
 
 
 def test_bad_input_is_named(flat, pupil):
+    for bad in ((0.0, 9), (float("nan"), 9), (2.0, 0)):
+        with pytest.raises(ParameterError):
+            optics.exponential_psf(*bad)
     with pytest.raises(ParameterError, match="PSF size = 129"):
         optics.psf(flat, pupil, 129)
     with pytest.raises(ParameterError, match="square grid"):

@@ -35,11 +35,12 @@ SMALL: dict[str, list[dict[str, Any]]] = {
         for form in ("linear", "physical")
     ],
     "unet": [_U],
+    "complex-unet": [_U],
     "dncnn": [{"width": 6, "depth": 4}],
 }
 """Arguments of a small network of each name."""
 
-_DOUBLE = ("still", "unet", "dncnn")  # registration is computed in float32 whatever the input
+_DOUBLE = ("still", "unet", "complex-unet", "dncnn")  # registration is computed in float32 whatever the input
 _ROUNDING = 1e-5
 _PLACE = 1e-4  # float32 knows a place in a picture as wide to 1e-5 pixels, and sampling there takes slopes of one
 _SIDE, _REACH = 240, 104  # pixels; from the second on no border is felt, two U-Nets one after the other included

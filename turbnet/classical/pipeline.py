@@ -13,6 +13,7 @@ r"""The default pipeline: reference, registration, fusion, blind deconvolution; 
 A moving object gains from no other frame: it keeps its own noise and its own blur, which is deconvolved with the rest.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -28,6 +29,7 @@ from turbnet.classical.reference import non_local_means, still_variance
 from turbnet.classical.registration import register
 from turbnet.classical.sharpness import variance
 from turbnet.errors import InputError
+from turbnet.optics.psf import exponential_psf
 from turbnet.simulate.parallel import on_all_cores
 
 PASSES = 2
@@ -99,13 +101,16 @@ def restore(frames_THWC: Array, cores: int = 1, report: Callable[[float], object
 
 
 def _widened(kernel_kk: Array, width: float) -> Array:
-    """The kernel with the Gaussian blur that edges of this `width` show beyond what it explains, pixels."""
+    """The kernel with the blur that edges of this `width`, pixels, show beyond what it explains; no smaller than before.
+
+    That blur falls off exponentially. At the middle of an edge exp(-r / a) is as steep as a Gaussian of s = a sqrt(pi / 2),
+    so its RMS width along either axis is sqrt(3) a = s sqrt(6 / pi).
+    """
     explained = 1 / (4 * np.pi * float((kernel_kk**2).sum()))  # of a Gaussian as peaked, its variance
     seen = width**2 - SHARP**2
     if seen <= EXPLAINED**2 * explained:
         return kernel_kk
-    beyond = seen - explained
-    axis = np.arange(len(kernel_kk)) - len(kernel_kk) // 2
-    line = np.exp(-(axis**2) / (2 * beyond))
-    wide = fftconvolve(kernel_kk, np.outer(line, line), mode="same")
-    return np.asarray(np.maximum(wide, 0) / np.maximum(wide, 0).sum(), dtype=kernel_kk.dtype)
+    sigma = math.sqrt((seen - explained) * 6 / math.pi)
+    kernel = np.pad(kernel_kk, max(0, math.ceil(4 * sigma) - len(kernel_kk) // 2))
+    wide = np.maximum(fftconvolve(kernel, exponential_psf(sigma, len(kernel)).numpy(), mode="same"), 0)
+    return np.asarray(wide / wide.sum(), dtype=kernel_kk.dtype)

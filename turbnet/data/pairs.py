@@ -1,17 +1,19 @@
 """The pair maker: clean clips in, turbulent clips with their truth out, inside the training loop."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, cast
 
-import numpy as np
 import torch
+import torch.nn.functional as F
 from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.errors import ParameterError, check_range
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.optics.psf import convolve, exponential_psf
 from turbnet.simulate.draw import Draw
 from turbnet.simulate.ranges import Conditions, Ranges
 from turbnet.simulate.simple import DirectToImage, GaussianDraw, WarpBlur
@@ -175,7 +177,8 @@ class PairMaker(nn.Module):
     @staticmethod
     def _sensed(frames: Tensor, blur_only: Tensor, seen_through: Conditions) -> tuple[Tensor, Tensor]:
         if seen_through.defocus > 0:
-            frames, blur_only = (defocused(clip, seen_through.defocus) for clip in (frames, blur_only))
+            lens = (seen_through.defocus, seen_through.tails)
+            frames, blur_only = (defocused(clip, *lens) for clip in (frames, blur_only))
         return seen_through.sensor(frames, seen_through.noise_seed), blur_only
 
 
@@ -185,9 +188,17 @@ def _together(draws: Sequence[Any]) -> Any:
     return replace(draws[0], **{name: torch.cat([getattr(draw, name) for draw in draws]) for name in tensors})
 
 
-def defocused(clip_BTCHW: Tensor, sigma: float) -> Tensor:
-    """Every frame through a Gaussian of RMS width `sigma` pixels in each axis; no wider than the frame allows."""
-    reach = min(int(np.ceil(3 * sigma)), min(clip_BTCHW.shape[-2:]) - 1)
-    size = 2 * reach + 1
-    flat = gaussian_blur2d(clip_BTCHW.flatten(0, 1), (size, size), (sigma, sigma))
+def defocused(clip_BTCHW: Tensor, sigma: float, tails: bool = False) -> Tensor:
+    """Every frame through a blur of RMS width `sigma` pixels along either axis; no wider than the frame allows.
+
+    A Gaussian, or with `tails` one that falls off exponentially (`turbnet.optics.psf.exponential_psf`).
+    """
+    reach = min(math.ceil((4 if tails else 3) * sigma), min(clip_BTCHW.shape[-2:]) - 1)
+    size, flat = 2 * reach + 1, clip_BTCHW.flatten(0, 1)
+    if tails:
+        padded = F.pad(flat, (reach, reach, reach, reach), mode="reflect")
+        seen = convolve(padded, exponential_psf(sigma, size).to(flat))
+        flat = seen[..., reach : reach + flat.shape[-2], reach : reach + flat.shape[-1]]
+    else:
+        flat = gaussian_blur2d(flat, (size, size), (sigma, sigma))
     return flat.unflatten(0, clip_BTCHW.shape[:2])

@@ -6,6 +6,7 @@ from typing import Any
 from torch import nn
 
 from turbnet.errors import InputError, check_range
+from turbnet.nets.complex_unet import ComplexUNet
 from turbnet.nets.dncnn import DnCNN
 from turbnet.nets.redegradation import Redegrading
 from turbnet.nets.restorer import Restorer
@@ -17,6 +18,7 @@ NETS: dict[str, type[nn.Module]] = {
     "still": StillRestorer,
     "redegrading": Redegrading,
     "unet": UNet,
+    "complex-unet": ComplexUNet,
     "dncnn": DnCNN,
 }
 """Every network that a config or a checkpoint can name."""

@@ -12,8 +12,9 @@ function
     H_s(f) = \exp\{-3.44\, (s f)^{5/3}\, (1 - f^{1/3})\}
 
 (f the frequency over the cutoff, of a camera that samples at Nyquist's rate, cutoff at half a cycle a pixel; negative lobes
-left out), or of a lens out of focus, a Gaussian. Light is not negative, nor is the picture: that bound is what a linear
-filter does not know. Nothing is learned here: a network that sees the guesses learns which to believe where.
+left out), that of a lens out of focus, a Gaussian, or that of blurs of many widths together, exp(-r / a). Light is not
+negative, nor is the picture: that bound is what a linear filter does not know. Nothing is learned here: a network that sees
+the guesses learns which to believe where.
 
 What a kernel takes from beyond a few pixels is as smooth as the picture, so it is taken at half the resolution: a fifth of
 the sums, and guesses from which a network restores as well.
@@ -29,6 +30,7 @@ from torch import Tensor, nn
 from turbnet.errors import check_range
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.nets.inverse import GRID, kernel_of, short_exposure_transfer
+from turbnet.optics.psf import exponential_psf
 
 _NEAR = 7  # pixels across what is convolved at full resolution
 DARKEST = 1e-3
@@ -39,7 +41,7 @@ class RichardsonLucy(nn.Module):
     """A picture deconvolved once for each kernel.
 
     Args:
-        kernels: (K, size, size), size odd, not negative, of sum one: `turbulence_kernel`, `defocus_kernel`.
+        kernels: (K, size, size), size odd, not negative, of sum one: `turbulence_kernel`, `defocus_kernel`, `tails_kernel`.
         steps: of the iteration.
 
     Raises:
@@ -77,18 +79,24 @@ class Deconvolution(nn.Module):
 
     Args:
         strengths: D/r0 of turbulence.
-        defocus: of lenses out of focus, RMS width of a Gaussian, pixels.
+        defocus: of lenses out of focus, RMS width of a Gaussian along either axis, pixels.
+        tails: of blurs that fall off exponentially, RMS width along either axis, pixels.
 
     Raises:
         ParameterError: a value out of range.
     """
 
-    def __init__(self, strengths: Sequence[float] = (2.0, 3.0, 4.5, 6.5), defocus: Sequence[float] = (2.5,)) -> None:
+    def __init__(
+        self,
+        strengths: Sequence[float] = (2.0, 3.0, 4.5, 6.5),
+        defocus: Sequence[float] = (2.5,),
+        tails: Sequence[float] = (),
+    ) -> None:
         super().__init__()
-        self.count = len(strengths) + len(defocus)
-        self.turbulence = RichardsonLucy([turbulence_kernel(strength) for strength in strengths], steps=8)
-        # A Gaussian leaves less of the high frequencies, and they come back slowly.
-        self.lens = RichardsonLucy([defocus_kernel(sigma) for sigma in defocus], steps=24)
+        self.count = len(strengths) + len(defocus) + len(tails)
+        # Wide blurs leave less of the high frequencies, and they come back slowly.
+        blurs = ((turbulence_kernel, strengths, 8), (defocus_kernel, defocus, 24), (tails_kernel, tails, 30))
+        self.blurs = nn.ModuleList(RichardsonLucy([kernel(x) for x in xs], steps) for kernel, xs, steps in blurs if xs)
 
     @torch.no_grad()
     def forward(self, picture_BCHW: Tensor) -> Tensor:
@@ -100,7 +108,7 @@ class Deconvolution(nn.Module):
             picture = picture_BCHW.float()
             inside = picture.clamp(0, 1)
             linear = to_linear(inside).clamp(min=DARKEST)
-            guesses = to_srgb(torch.cat((self.turbulence(linear), self.lens(linear)), dim=1).clamp(0, 1))
+            guesses = to_srgb(torch.cat([undo(linear) for undo in self.blurs], dim=1).clamp(0, 1))
             return (guesses + (picture - inside)[:, None]).to(picture_BCHW.dtype)
 
 
@@ -123,6 +131,16 @@ def defocus_kernel(sigma: float, size: int = 19) -> np.ndarray:
     line = np.exp(-(((np.arange(_checked(size)) - size // 2) / check_range("sigma", sigma, 0.1, 100.0)) ** 2) / 2)
     kernel = np.outer(line, line)
     return (kernel / kernel.sum()).astype(np.float32)
+
+
+def tails_kernel(sigma: float, size: int = 25) -> np.ndarray:
+    """`turbnet.optics.psf.exponential_psf` of RMS width `sigma` pixels along either axis, (size, size) float32, sum one.
+
+    Raises:
+        ParameterError: a value out of range.
+    """
+    kernel: np.ndarray = exponential_psf(sigma, _checked(size)).float().numpy()
+    return kernel
 
 
 def _checked(size: int) -> int:

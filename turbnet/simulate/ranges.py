@@ -46,7 +46,8 @@ class Conditions:
         geometry: which of `Ranges.paths()`.
         wind: velocity of the air across the path, x and y, m/s; None: every frame sees an atmosphere of its own.
         sensor: the camera's noise and compression.
-        defocus: RMS width of the Gaussian blur of the lens, pixels; 0 for none.
+        defocus: RMS width of the blur of the lens along either axis, pixels; 0 for none.
+        tails: that blur falls off exponentially, not as a Gaussian.
         draw_seed: of the atmosphere.
         noise_seed: of the sensor.
     """
@@ -56,6 +57,7 @@ class Conditions:
     wind: tuple[float, float] | None
     sensor: Sensor
     defocus: float
+    tails: bool
     draw_seed: int
     noise_seed: int
 
@@ -74,8 +76,9 @@ class Ranges:
         aperture, distance, wavelength: of the path, m, drawn uniformly in the logarithm; see `paths`.
         geometries: how many paths to draw. One stands in the (geometric) middle of the ranges.
         geometry_seed: of that draw.
-        defocus: RMS width of a Gaussian blur of the lens, the same in all frames, pixels, drawn uniformly.
+        defocus: RMS width of a blur of the lens along either axis, the same in all frames, pixels, drawn uniformly.
         blurred: fraction of clips that have it.
+        tails: fraction of those whose blur falls off exponentially, not as a Gaussian: see `turbnet.data.pairs.defocused`.
         jpeg: quality of compression, drawn uniformly.
         compressed: fraction of clips that are compressed.
         subframes: atmospheres averaged over the exposure of a frame. Reserved: 1, an instant exposure, is all there is.
@@ -97,6 +100,7 @@ class Ranges:
     geometry_seed: int = 0
     defocus: Range = (0.0, 3.0)
     blurred: float = 0.0
+    tails: float = 0.0
     jpeg: Range = (40, 95)
     compressed: float = 0.0
     subframes: int = 1
@@ -107,7 +111,7 @@ class Ranges:
         for name in ("geometries", "geometry_seed", "subframes"):
             if not isinstance(getattr(self, name), int):
                 raise ParameterError(f"{name} = {getattr(self, name)!r} must be a whole number")
-        for name in ("independent", "blurred", "compressed"):
+        for name in ("independent", "blurred", "tails", "compressed"):
             check_range(name, _number(name, getattr(self, name)), 0, 1)
         check_range("frame_rate", _number("frame_rate", self.frame_rate), 1e-3, 1e6, "frames a second")
         check_range("geometries", self.geometries, 1, 1000)
@@ -161,8 +165,9 @@ class Ranges:
         # Drawn last: clips of ranges without them are what they were before these came.
         defocus, blurred = uniform(*self.defocus), uniform(0, 1) < self.blurred  # type: ignore[misc]
         jpeg, compressed = round(uniform(*self.jpeg)), uniform(0, 1) < self.compressed  # type: ignore[misc]
+        tails = uniform(0, 1) < self.tails
         sensor = Sensor(full_well, read_noise, jpeg=jpeg if compressed else None)
-        return Conditions(strength, geometry, wind, sensor, defocus if blurred else 0.0, draw_seed, noise_seed)
+        return Conditions(strength, geometry, wind, sensor, defocus if blurred else 0.0, tails, draw_seed, noise_seed)
 
     def _geometric(self) -> list[tuple[float, float]]:
         return [self.aperture, self.distance, self.wavelength]  # type: ignore[list-item]

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from turbnet.data.clips import AnyScene
 from turbnet.errors import InputError, check_range
+from turbnet.nets.complex_unet import ComplexUNet
 from turbnet.nets.dncnn import DnCNN
 from turbnet.nets.restorer import Restorer
 from turbnet.nets.still import StillRestorer
@@ -43,7 +44,7 @@ class Restoration(SimulatedTask):
         more: see `SimulatedTask`.
     """
 
-    trains = (Restorer, StillRestorer, UNet, DnCNN)
+    trains = (Restorer, StillRestorer, UNet, ComplexUNet, DnCNN)
 
     def __init__(
         self,
