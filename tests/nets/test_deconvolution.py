@@ -179,6 +179,9 @@ def test_it_is_built_where_tensors_have_no_values():
 def test_values_out_of_range():
     with pytest.raises(ParameterError, match="sigma"):
         Deconvolution(tails=(-1.0,))
+    with pytest.raises(ParameterError, match="needs a kernel"):
+        Deconvolution((), ())
+    assert Deconvolution((), (), (3.5,)).count == 1
     with pytest.raises(ParameterError, match="size of a kernel"):
         turbulence_kernel(2.0, 64)
     with pytest.raises(ParameterError, match="size of a kernel"):

@@ -27,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbnet.errors import check_range
+from turbnet.errors import ParameterError, check_range
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.nets.inverse import GRID, kernel_of, short_exposure_transfer
 from turbnet.optics.psf import exponential_psf
@@ -83,7 +83,7 @@ class Deconvolution(nn.Module):
         tails: of blurs that fall off exponentially, RMS width along either axis, pixels.
 
     Raises:
-        ParameterError: a value out of range.
+        ParameterError: a value out of range, or no kernel at all.
     """
 
     def __init__(
@@ -94,6 +94,8 @@ class Deconvolution(nn.Module):
     ) -> None:
         super().__init__()
         self.count = len(strengths) + len(defocus) + len(tails)
+        if not self.count:
+            raise ParameterError("deconvolution needs a kernel: D/r0 of turbulence, defocus or tails")
         # Wide blurs leave less of the high frequencies, and they come back slowly.
         blurs = ((turbulence_kernel, strengths, 8), (defocus_kernel, defocus, 24), (tails_kernel, tails, 30))
         self.blurs = nn.ModuleList(RichardsonLucy([kernel(x) for x in xs], steps) for kernel, xs, steps in blurs if xs)
