@@ -70,8 +70,7 @@ def trained(name: str, steps: int, options: argparse.Namespace) -> Path:
     """The folder of one network's training."""
     folder: Path = options.output / name
     epochs = math.ceil(steps / EPOCH)
-    recipe = ["experiment=s", "net=unet"] if name == "unet" else [f"experiment={name}"]
-    arguments = [*recipe, "data=folders", f"data.frames=[1,{options.frames}]", "data.val_clips=6"]
+    arguments = [f"experiment={name}", "data=folders", f"data.frames=[1,{options.frames}]", "data.val_clips=6"]
     arguments += [f"data.size={SIZE}", f"data.batch_size={BATCH}", f"data.steps_per_epoch={EPOCH}"]
     arguments += [f"data.curriculum={steps // 4}", "data.text=0.25", "data.moving=0.25"]
     arguments += [f"trainer.check_val_every_n_epoch={math.gcd(epochs, 2)}", *options.overrides]
