@@ -104,6 +104,19 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(train, tmp_path, weights
     assert rows == [row for row in curve(resumed) if int(row["epoch"] or -1) >= 2]
 
 
+def test_epochs_that_nobody_validates_leave_their_weights_too(train, tmp_path, weights):
+    more = ("trainer.max_epochs=3", "trainer.check_val_every_n_epoch=2", "+callbacks.last.save_top_k=-1")
+    more += ("callbacks.last.filename='each{epoch}'", "+callbacks.last.auto_insert_metric_name=false")
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    train(whole, *more)
+    train(resumed, *more, f"resume={whole}/checkpoints/each0.ckpt")
+    kept = sorted(path.name for path in (whole / "checkpoints").iterdir())
+    assert kept == ["each0.ckpt", "each1.ckpt", "each2.ckpt", "epoch0001.ckpt"]
+    assert torch.load(whole / "checkpoints/each2.ckpt", weights_only=True)["global_step"] == 6
+    for name in kept[1:]:
+        assert same(weights(whole / "checkpoints" / name), weights(resumed / "checkpoints" / name))
+
+
 def test_resuming_into_the_same_folder_keeps_the_first_curve(train, tmp_path, curve):
     run = train(tmp_path / "run", "trainer.max_epochs=1")
     before = curve(run)
