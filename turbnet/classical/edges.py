@@ -34,8 +34,8 @@ def edge_width(luminance_HW: Array) -> float:
     Args:
         luminance_HW: linear intensities.
     """
-    along_y, along_x = np.gradient(luminance_HW)
-    steepness = np.hypot(along_x, along_y)
+    gradient = np.stack(np.gradient(luminance_HW))
+    steepness: Array = np.hypot(*gradient)
     contrast = maximum_filter(luminance_HW, _AROUND) - minimum_filter(luminance_HW, _AROUND)
     edges = (steepness >= maximum_filter(steepness, _APART)) & (steepness > 0)
     edges &= contrast > _STRONG * np.percentile(contrast, 95)
@@ -45,7 +45,7 @@ def edge_width(luminance_HW: Array) -> float:
         return 0.0
     slope, rise = steepness[y, x], contrast[y, x]
     widths = rise / (np.sqrt(2 * np.pi) * slope)
-    across = np.stack((along_y[y, x], along_x[y, x])) * (3 * widths / slope)
+    across = gradient[:, y, x] * (3 * widths / slope)
     before, behind = (map_coordinates(luminance_HW, (y, x) + way, order=1, mode="nearest") for way in (across, -across))
     widths /= np.interp((before - behind) / rise, _ACROSS, _OF_STEP)
     return float(np.percentile(widths, _SHARPEST))

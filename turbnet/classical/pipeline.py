@@ -42,8 +42,10 @@ ROUNDS = 1
 SHARP = 0.8
 """Width of the sharpest edges that nothing has blurred, pixels."""
 EXPLAINED = 1.7
-"""How much wider than the kernel edges may be before a lens, focus or sampling must have blurred them as well. In
-the benchmark they are up to 1.4 times as wide, 1.7 where frames hang together: such a clip dances less than its air blurs."""
+"""How much wider than the kernel edges may be before a lens, focus or sampling must have blurred them as well.
+
+In the benchmark up to 1.4 times, 1.7 where frames hang together: such a clip dances less than it is blurred.
+"""
 
 
 @dataclass(frozen=True)

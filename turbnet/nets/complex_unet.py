@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbnet.nets.blocks import conv3x3, each_frame, zero_start
+from turbnet.nets.scene import UBody
 
 
 class ComplexConv2d(nn.Module):
@@ -71,7 +72,7 @@ class ComplexBlock(nn.Module):
         return x_NCHW + self.second(F.relu(self.first(self.norm(x_NCHW))))
 
 
-class ComplexUNet(nn.Module):
+class ComplexUNet(UBody):
     """Each frame the real part, the clip's temporal mean the imaginary part of what a complex U-Net corrects.
 
     Args:
@@ -79,35 +80,22 @@ class ComplexUNet(nn.Module):
         depths: residual blocks at each scale, on the way down; on the way up as many but at the coarsest.
     """
 
-    size_multiple = 8
-
     def __init__(self, widths: Sequence[int] = (8, 16, 24), depths: Sequence[int] = (1, 1, 2)) -> None:
-        super().__init__()
+        nn.Module.__init__(self)
         pairs = list(zip(widths, widths[1:], strict=False))
         self.embed = ComplexConv2d(12, widths[0])
         self.down = nn.ModuleList(ComplexConv2d(a, b, 2, stride=2) for a, b in pairs)
+        self.know = None
         self.encode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths, depths, strict=True))
         self.up = nn.ModuleList(ComplexConv2d(b, 4 * a, 1) for a, b in pairs)
         self.decode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths[:-1], depths, strict=False))
         self.correct = conv3x3(2 * widths[0], 12)
         zero_start(self.correct)
 
-    def forward(self, frames_BTCHW: Tensor) -> Tensor:
+    def forward(self, frames_BTCHW: Tensor) -> Tensor:  # type: ignore[override]
         """Restored frames (B, T, C, H, W), sRGB-encoded in [0, 1] like the input; H and W multiples of `size_multiple`."""
         mean = frames_BTCHW.mean(1, keepdim=True).expand_as(frames_BTCHW)
-        return frames_BTCHW + each_frame(self._correction, torch.cat((frames_BTCHW, mean), dim=2))
-
-    def _correction(self, x_NCHW: Tensor) -> Tensor:
-        x = self.embed(F.pixel_unshuffle(x_NCHW, 2))
-        passed: list[Tensor] = []
-        for scale, encode in enumerate(self.encode):
-            if scale:
-                passed.append(x)
-                x = self.down[scale - 1](x)
-            x = encode(x)
-        for scale in reversed(range(len(passed))):
-            x = self.decode[scale](passed[scale] + F.pixel_shuffle(self.up[scale](x), 2))
-        return F.pixel_shuffle(self.correct(x), 2)
+        return frames_BTCHW + each_frame(super().forward, torch.cat((frames_BTCHW, mean), dim=2))
 
 
 def _blocks(channels: int, depth: int) -> nn.Sequential:

@@ -85,7 +85,7 @@ class UBody(nn.Module):
         depths: Sequence[int] = (1, 2, 4),
     ) -> None:
         super().__init__()
-        self.embed = conv3x3(4 * inner, widths[0])
+        self.embed: nn.Module = conv3x3(4 * inner, widths[0])
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:], strict=False))
         self.know = nn.Conv2d(known, widths[1], 1) if known else None
         self.encode = nn.ModuleList(_blocks(w, d) for w, d in zip(widths, depths, strict=True))
