@@ -34,7 +34,7 @@ def edge_width(luminance_HW: Array) -> float:
     Args:
         luminance_HW: linear intensities.
     """
-    gradient = np.stack(np.gradient(luminance_HW))
+    gradient = np.asarray(np.gradient(luminance_HW))
     steepness: Array = np.hypot(*gradient)
     contrast = maximum_filter(luminance_HW, _AROUND) - minimum_filter(luminance_HW, _AROUND)
     edges = (steepness >= maximum_filter(steepness, _APART)) & (steepness > 0)
