@@ -13,6 +13,7 @@ from turbnet.deploy.card import ModelCard
 from turbnet.deploy.export import compare, export_onnx, flush_denormals
 from turbnet.deploy.session import Model
 from turbnet.errors import InputError
+from turbnet.nets.deconvolution import RichardsonLucy, tails_kernel, turbulence_kernel
 
 
 def test_reproduces_torch_on_shapes_it_was_not_exported_with(network, model_file):
@@ -132,3 +133,24 @@ def test_card_beside_the_file(model_file, tmp_path):
     assert text.startswith("# model\n")
     assert card.sha256 in text
     assert "multiples of 4" in text
+
+
+class Deconvolved(nn.Module):
+    """The first guess at every frame."""
+
+    def __init__(self):
+        super().__init__()
+        self.undo = RichardsonLucy([turbulence_kernel(2.0), tails_kernel(3.0, 19)], steps=3)
+
+    def forward(self, frames_BTCHW):
+        return self.undo(frames_BTCHW.flatten(0, 1) + 0.01)[:, 1].unflatten(0, frames_BTCHW.shape[:2])
+
+
+def test_deconvolution_goes_through_in_one_piece(card, tmp_path):
+    """What the exporter is told of it computes what torch does, and the network itself stays as it was."""
+    network = Deconvolved().eval()
+    parity = export_onnx(network, card, tmp_path / "undo.onnx")
+    assert max(row.difference for row in parity) < 1e-5
+    assert network.undo.iterate is RichardsonLucy.iterate
+    kinds = [node.op_type for node in onnx.load(tmp_path / "undo.onnx").graph.node]
+    assert kinds.count("Resize") == 2 * 3

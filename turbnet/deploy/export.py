@@ -23,6 +23,7 @@ from onnxscript import opset18
 from torch import nn
 
 from turbnet.deploy.card import Card, ModelCard
+from turbnet.deploy.opaque import TRANSLATIONS, opaque
 from turbnet.deploy.seal import seal
 from turbnet.deploy.session import INPUT, NEXT, OUTPUT, Model
 from turbnet.errors import InputError
@@ -144,7 +145,7 @@ def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
     try:
         with quiet_exporter():
             program = torch.onnx.export(
-                module,
+                opaque(copy.deepcopy(module)),
                 (clip, *carried),
                 dynamo=True,
                 input_names=[INPUT, *card.carried],
@@ -152,7 +153,7 @@ def _to_onnx(module: nn.Module, card: ModelCard) -> onnx.ModelProto:
                 dynamic_shapes=(free, *sides),
                 external_data=False,
                 verbose=False,
-                custom_translation_table={torch.ops.aten.pixel_unshuffle.default: _pixel_unshuffle},
+                custom_translation_table={torch.ops.aten.pixel_unshuffle.default: _pixel_unshuffle, **TRANSLATIONS},
             )
     except torch.onnx.OnnxExporterError as error:
         cause = error.__cause__ or error

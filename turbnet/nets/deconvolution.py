@@ -64,14 +64,20 @@ class RichardsonLucy(nn.Module):
         """(B, K, C, H, W), linear intensities as the picture's, which are 0.001 at least; H and W even."""
         channels = linear_BCHW.shape[1]
         # All guesses of all colours side by side: processors convolve channels together.
-        kernels = [part.repeat_interleave(channels, dim=0) for part in (self.near, self.far)]
-        seen = linear_BCHW.repeat(1, self.count, 1, 1)
-        found = guess = seen
-        for step in range(self.steps):
-            before = found
-            found = guess * _blurred(seen / _blurred(guess, *kernels).clamp(min=DARKEST), *kernels)
-            guess = (found + step / (step + 3) * (found - before)).clamp(min=DARKEST)
+        near, far = (part.repeat_interleave(channels, dim=0) for part in (self.near, self.far))
+        found = self.iterate(linear_BCHW.repeat(1, self.count, 1, 1), near, far, self.steps)
         return found.unflatten(1, (self.count, channels))
+
+    @staticmethod
+    def iterate(seen_BCHW: Tensor, near_C1kk: Tensor, far_C1kk: Tensor, steps: int) -> Tensor:
+        """The iteration itself, each channel with its kernel."""
+        found = guess = seen_BCHW
+        for step in range(steps):
+            before = found
+            again = _blurred(guess, near_C1kk, far_C1kk).clamp(min=DARKEST)
+            found = guess * _blurred(seen_BCHW / again, near_C1kk, far_C1kk)
+            guess = (found + step / (step + 3) * (found - before)).clamp(min=DARKEST)
+        return found
 
 
 class Deconvolution(nn.Module):
