@@ -1,6 +1,6 @@
 """Whether a restorer learns from clips without truth: trained on weak turbulence, fine-tuned on strong, measured on both.
 
-    python tools/adaptation.py --pictures FOLDER [--kind lens] [--epochs 30] [--tuning 6] [--seeds 5] [--output FOLDER]
+    python tools/adaptation.py --pictures FOLDER [--kind lens] [--clips] [--epochs 30] [--tuning 6] [--seeds 5]
 
 Trains `task=redegradation net=redegrading` at D/r0 = 1 to 2, then `task=finetune` on clips at D/r0 = 4 of a new kind, with
 more noise, a lens out of focus, a blur with tails or much more noise, simulated from pictures of the folder and kept as
@@ -52,6 +52,8 @@ def main() -> int:
         "--real", nargs="+", type=Path, help="folders of clips to fine-tune on in place of simulated ones"
     )
     parser.add_argument("--kind", choices=KINDS, default="lens", help="of the clips without truth")
+    parser.add_argument("--clips", action="store_true", help="a restorer of clips, in place of one of single frames")
+    parser.add_argument("--rate", type=float, default=1e-3, help="learning rate without truth")
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
@@ -64,7 +66,7 @@ def main() -> int:
     torch.set_num_threads(options.threads)
 
     old = [f"simulator.{name}={value}" for name, value in OLD.items()]
-    first = trained(options, "trained", options.epochs, ["task=redegradation", "data.frames=4", *old])
+    first = trained(options, "trained", options.epochs, ["task=redegradation", *old])
     unlabelled = options.real or [simulate(options)]
     before = load(first)
     clips = {name: list(scenes(where)) for name, where in (("old", OLD), ("new", KINDS[options.kind]))}
@@ -72,7 +74,8 @@ def main() -> int:
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
-        more += ["data.clip_frames=4", "task.learning_rate=1e-3", "task.agree_weight=3"]
+        more += [f"data.clip_frames={8 if options.clips else 4}", f"task.learning_rate={options.rate}"]
+        more += ["task.agree_weight=3"]
         tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         print({name: round(value, 4) for name, value in rows[f"fine-tuned, seed {seed}"].items()}, flush=True)
@@ -87,8 +90,9 @@ def main() -> int:
 
 def trained(options: argparse.Namespace, name: str, epochs: int, arguments: list[str]) -> Path:
     """The last checkpoint of one training."""
-    common = ["net=redegrading", "data.size=96", "data.steps_per_epoch=50", "data.moving=0"]
-    arguments = [*common, *arguments, *options.overrides]
+    of = ["net=redegrading_clip", "data.frames=8"] if options.clips else ["net=redegrading", "data.frames=4"]
+    common = ["data.size=96", "data.steps_per_epoch=50", "data.moving=0"]
+    arguments = [*of, *common, *arguments, *options.overrides]
     return train(options.output / name, epochs, options.pictures, options.threads, arguments)
 
 

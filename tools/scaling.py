@@ -36,9 +36,10 @@ SIZE, BATCH, EPOCH = 128, 3, 20
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pictures", nargs="+", type=Path, required=True, help="clean pictures: folders, packs")
-    parser.add_argument("--steps", nargs="+", default=["xs=800", "s=400", "m=200"], metavar="NET=N")
+    steps = [("xs", 800), ("s", 400), ("m", 200)]
+    parser.add_argument("--steps", nargs="+", type=wanted, default=steps, metavar="NET=N")
     parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--also", nargs="+", default=[], metavar="NAME=CLIPS:FRAMES:CHECKPOINT")
+    parser.add_argument("--also", nargs="+", type=elsewhere, default=[], metavar="NAME=CLIPS:FRAMES:CHECKPOINT")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--output", type=Path, default=Path("outputs/scaling"))
     parser.add_argument("--figure", type=Path, default=Path("docs/images/scaling.png"))
@@ -47,14 +48,13 @@ def main() -> int:
     )
     options = parser.parse_args()
     curves: dict[str, list[tuple[int, float, float]]] = {}
-    for name, steps in (entry.split("=") for entry in options.steps):
-        folder = trained(name, int(steps), options)
+    for name, steps in options.steps:
+        folder = trained(name, steps, options)
         cost = 3 * clip_flops(OmegaConf.load(folder / "config.yaml").net, options.frames)
         curves[name] = [(BATCH * step, BATCH * step * cost, quality) for step, quality in history(folder)]
-    for name, entry in (entry.split("=", 1) for entry in options.also):
-        clips, frames, path = entry.split(":", 2)
-        cost = 3 * clip_flops(read_checkpoint(path)["hyper_parameters"]["net"], int(frames))
-        point = (int(clips), int(clips) * cost, validated(Path(path), folder))
+    for name, clips, frames, path in options.also:
+        cost = 3 * clip_flops(read_checkpoint(path)["hyper_parameters"]["net"], frames)
+        point = (clips, clips * cost, validated(path, folder))
         curves.setdefault(f"{name}, elsewhere", []).append(point)
     lines = ["| network | clips | TFLOP | PSNR, dB |", "|---|---|---|---|"]
     for name, curve in curves.items():
@@ -64,6 +64,19 @@ def main() -> int:
         temporary.write_text(json.dumps(curves, indent=2) + "\n")
     draw(curves, options.figure)
     return 0
+
+
+def wanted(entry: str) -> tuple[str, int]:
+    """NET=N."""
+    name, steps = entry.split("=")
+    return name, int(steps)
+
+
+def elsewhere(entry: str) -> tuple[str, int, int, Path]:
+    """NAME=CLIPS:FRAMES:CHECKPOINT."""
+    name, rest = entry.split("=", 1)
+    clips, frames, path = rest.split(":", 2)
+    return name, int(clips), int(frames), Path(path)
 
 
 def trained(name: str, steps: int, options: argparse.Namespace) -> Path:
