@@ -60,13 +60,24 @@ def test_ctrl_c_ends_training_after_the_step_at_hand(tiny, tmp_path, monkeypatch
     assert signal.getsignal(signal.SIGINT) == before
 
 
-@pytest.mark.parametrize(("known", "precision"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_bfloat16_is_for_processors_that_know_it(monkeypatch, capsys, known, precision):
+@pytest.mark.parametrize(
+    ("machine", "known", "tiles", "precision"),
+    [
+        ("x86_64", True, True, "bf16-mixed"),
+        ("x86_64", True, False, "32-true"),
+        ("x86_64", False, False, "32-true"),
+        ("aarch64", True, False, "bf16-mixed"),
+        ("aarch64", False, False, "32-true"),
+    ],
+)
+def test_bfloat16_is_for_processors_where_it_pays(monkeypatch, capsys, machine, known, tiles, precision):
+    monkeypatch.setattr("platform.machine", lambda: machine)
     monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: known)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: tiles)
     trainer = {"accelerator": "cpu", "precision": "bf16-mixed"}
     _check_precision(trainer)
     assert trainer["precision"] == precision
-    assert ("bfloat16" in capsys.readouterr().out) != known
+    assert ("bfloat16" in capsys.readouterr().out) == (precision == "32-true")
 
 
 def test_a_checkpoint_holds_tensors_and_plain_values(stage_one):
