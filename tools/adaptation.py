@@ -41,6 +41,8 @@ KINDS = {
     "tails": {**NOISY, "defocus": 2.5, "tails": 1.0},
     "dark": {**NOISY, "full_well": 300.0, "read_noise": 0.06, "defocus": 1.0},
 }
+TUNED_FRAMES = ("data.clip_frames=4", "task.learning_rate=1e-3")
+TUNED_CLIPS = ("data.clip_frames=8", "task.learning_rate=2e-4", "task.rehearsal_weight=4")
 FRAMES, SCENES, BORDER = 16, 4, 8
 UNLABELLED = 16  # clips
 
@@ -53,7 +55,6 @@ def main() -> int:
     )
     parser.add_argument("--kind", choices=KINDS, default="lens", help="of the clips without truth")
     parser.add_argument("--clips", action="store_true", help="a restorer of clips, in place of one of single frames")
-    parser.add_argument("--rate", type=float, default=1e-3, help="learning rate without truth")
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
@@ -74,8 +75,7 @@ def main() -> int:
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
-        more += [f"data.clip_frames={8 if options.clips else 4}", f"task.learning_rate={options.rate}"]
-        more += ["task.agree_weight=3"]
+        more += ["task.agree_weight=3", *(TUNED_CLIPS if options.clips else TUNED_FRAMES)]
         tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         print({name: round(value, 4) for name, value in rows[f"fine-tuned, seed {seed}"].items()}, flush=True)
