@@ -5,7 +5,6 @@ of another picture passes, in clear air and at D/r0 = 2. Every time is the least
 as `turbnet restore` does; ratios are of runs that take turns, so that what else the machine does hits both.
 """
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import torch
 
 from turbnet.atmosphere.path import OpticalPath
 from turbnet.bench import precision
+from turbnet.bench.memory import run_measured
 from turbnet.bench.suite import Frames
 from turbnet.data.sources import embedded_paths, load_picture
 from turbnet.deploy.restore import restore_array, window_of
@@ -165,12 +165,10 @@ def _memory(file: Path, quick: bool) -> list[Row]:
         picture = load_picture(embedded_paths("test")[0])
         large = np.tile(picture, (1080 // picture.shape[0] + 1, 1920 // picture.shape[1] + 1, 1))[:1080, :1920]
         write_clip(source, np.broadcast_to(large, (count, *large.shape)))
-        child = subprocess.Popen(_command(file, source, Path(folder) / "out.mkv"))
-        _, status, used = os.wait4(child.pid, 0)  # of this child alone
-        child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
+        done, peak = run_measured(_command(file, source, Path(folder) / "out.mkv"))
+    if done.returncode:
         raise InputError(f"{file}: turbnet restore failed on 1920 x 1080")
-    return [Row(f"1920 x 1080, {count} frames: peak memory", used.ru_maxrss / 2**20, "GiB")]
+    return [Row(f"1920 x 1080, {count} frames: peak memory", peak, "GiB")]
 
 
 def _command(file: Path, source: Path, target: Path) -> list[str]:

@@ -8,9 +8,8 @@ mean geometry of the clip's frames: without fault but for what they cannot tell.
 
 import multiprocessing
 import multiprocessing.connection
-import resource
 import shlex
-import subprocess
+import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Sequence
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from turbnet.bench.memory import own_peak, run_measured
 from turbnet.bench.suite import KINDS, SUITES, Clip, Frames, Restore, make_clip, names
 from turbnet.errors import InputError
 from turbnet.media.atomic import atomic_path
@@ -115,25 +115,26 @@ def run(wanted: Sequence[Entrant], suite: str = "standard", quiet: bool = False)
 def _work(entrant: Entrant, suite: str, sender: "multiprocessing.connection.Connection") -> None:
     """In the entrant's process: a number for each clip done, then the result, or what went wrong."""
     try:
-        restore, result = _restorer(entrant), Result(entrant)
+        peaks: list[float] = []
+        restore, result = _restorer(entrant, peaks), Result(entrant)
         for kind, scene, strength in names(SUITES[suite]):
             whole = make_clip(kind, scene, strength, max(SUITES[suite].lengths))
             result.scores += [_score(restore, whole.first(length)) for length in SUITES[suite].lengths]
             sender.send(len(result.scores))
-        who = resource.RUSAGE_CHILDREN if entrant.kind == "external" else resource.RUSAGE_SELF
-        result.memory = resource.getrusage(who).ru_maxrss / 2**20
+        result.memory = max(peaks) if peaks else own_peak()
         sender.send(result)
     except InputError as error:
         sender.send(str(error))
 
 
-def _restorer(entrant: Entrant) -> Restore:
+def _restorer(entrant: Entrant, peaks: list[float]) -> Restore:
+    """What restores; of an outside command the memory, GiB, is added to `peaks` each time."""
     if entrant.kind == "input":
         return lambda clip: clip.frames
     if entrant.kind == "settled":
         return Clip.settled
     if entrant.kind == "external":
-        return lambda clip: _by_command(entrant.name, clip.frames)
+        return lambda clip: _by_command(entrant.name, clip.frames, peaks)
     from turbnet.deploy.method import ClassicalMethod
     from turbnet.deploy.restore import restore_array
     from turbnet.deploy.session import Model
@@ -150,17 +151,17 @@ def _restorer(entrant: Entrant) -> Restore:
     return restore
 
 
-def _by_command(command: str, frames: Frames) -> Frames:
+def _by_command(command: str, frames: Frames, peaks: list[float]) -> Frames:
     from turbnet.media.clip import read_clip, write_clip
 
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "in.mkv", Path(folder) / "out.mkv"
         write_clip(source, frames)
         parts = [part.replace("{in}", str(source)).replace("{out}", str(target)) for part in shlex.split(command)]
-        try:
-            done = subprocess.run(parts, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise InputError(f"cannot be run: {error}") from error
+        if shutil.which(parts[0]) is None:
+            raise InputError(f"cannot be run: there is no program {parts[0]}")
+        done, peak = run_measured(parts, capture_output=True, text=True, check=False)
+        peaks.append(peak)
         if done.returncode:
             said = (done.stderr or done.stdout).strip().splitlines()
             raise InputError(f"ended with {done.returncode}: {said[-1] if said else 'said nothing'}")

@@ -104,13 +104,13 @@ def _backward(simulator: Simulator, repeats: int) -> float:
 def _large(cores: int) -> tuple[float, float]:
     """Seconds of a 3840 x 2160 frame and GiB of its process, which does nothing else."""
     code = (
-        "import resource, time, torch; torch.set_grad_enabled(False); "
+        "import time, torch; torch.set_grad_enabled(False); from turbnet.bench.memory import own_peak; "
         f"torch.set_num_threads({cores}); "
         "from turbnet.atmosphere.path import OpticalPath; from turbnet.simulate.simulator import Simulator; "
         "s = Simulator(OpticalPath.from_d_over_r0(3.0), 2160, 3840); x = torch.rand(1, 1, 3, 2160, 3840); t = []\n"
         "for seed in range(3):\n"
         "    start = time.perf_counter(); s(x, s.draw([seed])); t.append(time.perf_counter() - start)\n"
-        "print(min(t), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)"
+        "print(min(t), own_peak())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     seconds, gib = (float(value) for value in done.stdout.split())
