@@ -167,7 +167,7 @@ def run(name: str, options: argparse.Namespace) -> int:
     pictures = ",".join(str(path.resolve()) for path in options.pictures)
     arguments = ["experiment=xs", f"data.folders=[{pictures}]", f"threads={options.threads}", f"output={output}"]
     arguments += ["callbacks=quiet", f"trainer.max_epochs={options.epochs}", *VARIANTS[name]]
-    arguments += ["trainer.check_val_every_n_epoch=5", *options.overrides]
+    arguments += options.overrides
     return train([*arguments, *([f"resume={last.resolve()}"] if last.is_file() else [])])
 
 

@@ -14,6 +14,7 @@ import av
 import numpy as np
 import pytest
 
+from turbnet.bench.memory import run_measured
 from turbnet.media.clip import read_clip, write_clip
 
 HEIGHT, WIDTH = 48, 64
@@ -166,18 +167,12 @@ def test_ctrl_c_ends_a_silent_pipe(model, tmp_path):
     assert len(read_clip(tmp_path / "out.mkv")[0]) > 100
 
 
-def peak_memory(model, frames: int, target) -> int:
+def peak_memory(model, frames: int, target) -> float:
     """KiB, of a process that restores a pipe of so many frames."""
-    process = subprocess.Popen(
-        command("-", "-o", target, "--model", model, "--quiet", "--threads", 1), stdin=subprocess.PIPE
-    )
-    assert process.stdin
-    with process.stdin as pipe:
-        for frame in y4m(range(frames)):
-            pipe.write(frame)
-    _, status, usage = os.wait4(process.pid, 0)
-    assert status == 0
-    return usage.ru_maxrss
+    words = command("-", "-o", target, "--model", model, "--quiet", "--threads", 1)
+    done, peak = run_measured(words, input=b"".join(y4m(range(frames))))
+    assert done.returncode == 0
+    return peak * 2**20
 
 
 def test_memory_does_not_depend_on_length(model, tmp_path):

@@ -23,7 +23,7 @@ from onnxscript import opset18
 from torch import nn
 
 from turbnet.deploy.card import Card, ModelCard
-from turbnet.deploy.opaque import TRANSLATIONS, opaque
+from turbnet.deploy.deconvolution import TRANSLATIONS, opaque
 from turbnet.deploy.seal import seal
 from turbnet.deploy.session import INPUT, NEXT, OUTPUT, Model
 from turbnet.errors import InputError

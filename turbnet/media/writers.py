@@ -344,12 +344,9 @@ def _x264() -> dict[str, str]:
     return {"x264-params": "asm=avx2"} if any(name.startswith(("AVX512", "X86_V4")) for name in found) else {}
 
 
-_X264 = _x264()
-
-
 class _H264(_Video):
     def open_stream(self, height: int, width: int) -> Any:
-        options = {"crf": "16", **_X264}
+        options = {"crf": "16", **_x264()}
         stream = self.container.add_stream("libx264", rate=self.rate, time_base=self.clock, options=options)
         stream.width, stream.height = width, height
         stream.pix_fmt = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
