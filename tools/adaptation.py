@@ -5,7 +5,7 @@
 Trains `task=redegradation net=redegrading` at D/r0 = 1 to 2, then `task=finetune` on clips at D/r0 = 4 of a new kind, with
 more noise, a lens out of focus, a blur with tails or much more noise, simulated from pictures of the folder and kept as
 files without their truth, once for each seed. Clips of both kinds over the still scenes of the benchmark, which neither saw,
-then tell what was gained and what was lost.
+then tell what was gained and what was lost, by the weights as tuned and by their mean with those before (--before).
 Resumable: what is trained is not trained again. Prints a table and keeps it in --output. With --real FOLDER it does the same
 with clips of its own: there is no truth, so the re-degradation error and the residual jitter are measured.
 """
@@ -31,7 +31,7 @@ from turbnet.metrics.fidelity import psnr
 from turbnet.metrics.stability import jitter
 from turbnet.nets import build
 from turbnet.nets.redegradation import Redegrading
-from turbnet.tasks.checkpoint import load_net, read_checkpoint
+from turbnet.tasks.checkpoint import load_net, mean_of, read_checkpoint
 from turbnet.tasks.losses import charbonnier
 
 OLD = {"d_over_r0": [1.0, 2.0], "full_well": 20_000.0, "read_noise": [0.0, 0.02]}
@@ -58,6 +58,7 @@ def main() -> int:
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
+    parser.add_argument("--before", type=float, default=0.2, help="share of the weights before in the mean")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--output", type=Path, default=Path("outputs/adaptation"))
     parser.add_argument(
@@ -78,7 +79,11 @@ def main() -> int:
         more += ["task.agree_weight=3", *(TUNED_CLIPS if options.clips else TUNED_FRAMES)]
         tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
-        print({name: round(value, 4) for name, value in rows[f"fine-tuned, seed {seed}"].items()}, flush=True)
+        mean = options.output / f"{options.kind}-{seed}" / "mean.ckpt"
+        with atomic_path(mean) as temporary:
+            torch.save(mean_of([first, tuned], [options.before, 1 - options.before]), temporary)
+        rows[f"mean, seed {seed}"] = measure(load(mean), clips, options.real)
+        print({name: round(value, 4) for name, value in rows[f"mean, seed {seed}"].items()}, flush=True)
     lines = ["| network | " + " | ".join(rows["trained"]) + " |", "|---" * (1 + len(rows["trained"])) + "|"]
     for name, row in rows.items():
         lines.append(f"| {name} | " + " | ".join(f"{v:.3f}" if v < 1 else f"{v:.2f}" for v in row.values()) + " |")

@@ -9,6 +9,7 @@ import torch
 
 from turbnet.deploy.card import ModelCard
 from turbnet.deploy.checkpoint import frame_by_frame
+from turbnet.deploy.eight_bits import write_eight_bits
 from turbnet.deploy.export import export_onnx
 from turbnet.deploy.restore import restore_array, restore_clip
 from turbnet.deploy.session import Model
@@ -97,3 +98,9 @@ def test_a_window_has_no_meaning(model, tmp_path):
 def test_only_a_restorer_goes_frame_by_frame():
     with pytest.raises(InputError, match="only a restorer"):
         frame_by_frame(torch.nn.Identity(), ModelCard("identity", {}, 1, 1), 10.0, 3)
+
+
+def test_no_eight_bits_frame_by_frame(made, tmp_path):
+    with pytest.raises(InputError, match="goes frame by frame"):
+        write_eight_bits(made[1], tmp_path / "small.onnx", [])
+    assert not any(tmp_path.iterdir())

@@ -1,21 +1,19 @@
-"""Whether a network is worth running in eight bits: convolutions quantised after training, by onnxruntime's own tool.
+"""Whether a network is worth running in eight bits.
 
-Weights by channel, activations calibrated on two clips of the benchmark; everything but dense convolutions stays in
-float32. It is worth it if it is a tenth faster at least and loses a tenth of a decibel at most in scenes of every kind at
-D/r0 = 3 that it was not calibrated on. Half precision is no question: onnxruntime has no kernels for it on a processor and
-would convert.
+It is worth it if it is a tenth faster at least and loses a tenth of a decibel at most in scenes of every kind at D/r0 = 3
+that it was not calibrated on. Half precision is no question: onnxruntime has no kernels for it on a processor and would
+convert.
 """
 
-import logging
 import tempfile
 import time
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from turbnet.bench.suite import SUITES, make_clip
+from turbnet.deploy.eight_bits import write_eight_bits
 from turbnet.deploy.session import INPUT, available_cores, open_session
 from turbnet.metrics.fidelity import psnr
 from turbnet.report import Row
@@ -27,67 +25,65 @@ KINDS = ("static", "dynamic", "text")
 FRAMES, STRENGTH, BORDER = 6, 3.0, 8
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """What eight bits bring.
+
+    Attributes:
+        faster: how many times as fast, the median of all scenes.
+        losses: dB of PSNR by kind of scene.
+    """
+
+    faster: float
+    losses: dict[str, float]
+
+    @property
+    def worth_it(self) -> bool:
+        return self.faster >= FASTER and max(self.losses.values()) <= LOSS
+
+    def __str__(self) -> str:
+        lost = ", ".join(f"{loss:.3f} dB of {kind} scenes" for kind, loss in self.losses.items())
+        return f"{self.faster:.2f} times as fast here, loses {lost}"
+
+    def rows(self) -> list[Row]:
+        lost = [Row(f"int8: loses, {kind} scenes", loss, "dB") for kind, loss in self.losses.items()]
+        return [
+            Row("int8: faster by", self.faster, "x"),
+            *lost,
+            Row("int8: worth it", "yes" if self.worth_it else "no"),
+        ]
+
+
 def measure(file: Path, quick: bool = False) -> list[Row]:
     """Speed, loss by kind of scene and verdict for the ONNX file of a network that takes windows."""
-    scenes = range(1, 2 if quick else SUITES["standard"].scenes)
     with tempfile.TemporaryDirectory() as folder:
-        files = (file, _quantised(file, Path(folder) / "int8.onnx"))
-        sessions = [open_session(path.read_bytes(), available_cores()) for path in files]
-        losses, ratios = dict[str, float](), list[float]()
-        for kind in KINDS:
-            lost = []
-            for scene in scenes:
-                clip = make_clip(kind, scene, STRENGTH, FRAMES)
-                frames = np.ascontiguousarray(clip.frames.transpose(0, 3, 1, 2)[None], np.float32)
-                times, scores = [], []
-                for session in sessions:
-                    begun = time.perf_counter()
-                    (restored,) = session.run(None, {INPUT: frames})
-                    times.append(time.perf_counter() - begun)
-                    shown = restored[0].transpose(0, 2, 3, 1).clip(0, 1)
-                    scores.append(float(psnr(shown, clip.target, BORDER).mean()))
-                lost.append(scores[0] - scores[1])
-                ratios.append(times[0] / times[1])
-            losses[kind] = float(np.mean(lost))
-    faster = float(np.median(ratios))
-    worth = "yes" if faster >= FASTER and max(losses.values()) <= LOSS else "no"
-    rows = [Row(f"int8: loses, {kind} scenes", loss, "dB") for kind, loss in losses.items()]
-    return [Row("int8: faster by", faster, "x"), *rows, Row("int8: worth it", worth)]
+        return judge(file, calibrated(file, Path(folder) / "int8.onnx"), quick).rows()
 
 
-def _quantised(source: Path, target: Path) -> Path:
-    import onnx
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
-
-    class Clips(CalibrationDataReader):
-        def __init__(self) -> None:
-            self.left: Iterator[str] = iter(("static", "text"))
-
-        def get_next(self) -> dict[str, Any] | None:
-            kind = next(self.left, None)
-            if kind is None:
-                return None
-            frames = make_clip(kind, 0, STRENGTH, FRAMES).frames
-            return {INPUT: np.ascontiguousarray(frames.transpose(0, 3, 1, 2)[None], np.float32)}
-
-    # Convolutions channel by channel are the closed-form ones of deconvolution, and slow in eight bits.
-    nodes = onnx.load(source).graph.node
-    exact = [n.name for n in nodes if n.op_type == "Conv" and any(a.name == "group" and a.i > 1 for a in n.attribute)]
-    log = logging.getLogger()
-    level = log.level
-    log.setLevel(logging.ERROR)  # it would like another pass over the file first
-    try:
-        quantize_static(
-            source,
-            target,
-            Clips(),
-            quant_format=QuantFormat.QDQ,
-            per_channel=True,
-            op_types_to_quantize=["Conv"],
-            nodes_to_exclude=exact,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-        )
-    finally:
-        log.setLevel(level)
+def calibrated(source: Path, target: Path) -> Path:
+    """The network in eight bits, calibrated on the first still scene and the first text."""
+    write_eight_bits(source, target, (make_clip(kind, 0, STRENGTH, FRAMES).frames for kind in ("static", "text")))
     return target
+
+
+def judge(exact: Path, rounded: Path, quick: bool = False) -> Verdict:
+    """The file of a network beside that of the same in eight bits, on this machine."""
+    scenes = range(1, 2 if quick else SUITES["standard"].scenes)
+    sessions = [open_session(path.read_bytes(), available_cores()) for path in (exact, rounded)]
+    losses, ratios = dict[str, float](), list[float]()
+    for kind in KINDS:
+        lost = []
+        for scene in scenes:
+            clip = make_clip(kind, scene, STRENGTH, FRAMES)
+            frames = np.ascontiguousarray(clip.frames.transpose(0, 3, 1, 2)[None], np.float32)
+            times, scores = [], []
+            for session in sessions:
+                begun = time.perf_counter()
+                (restored,) = session.run(None, {INPUT: frames})
+                times.append(time.perf_counter() - begun)
+                shown = restored[0].transpose(0, 2, 3, 1).clip(0, 1)
+                scores.append(float(psnr(shown, clip.target, BORDER).mean()))
+            lost.append(scores[0] - scores[1])
+            ratios.append(times[0] / times[1])
+        losses[kind] = float(np.mean(lost))
+    return Verdict(float(np.median(ratios)), losses)
