@@ -15,6 +15,7 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,10 +42,25 @@ KINDS = {
     "tails": {**NOISY, "defocus": 2.5, "tails": 1.0},
     "dark": {**NOISY, "full_well": 300.0, "read_noise": 0.06, "defocus": 1.0},
 }
-TUNED_FRAMES = ("data.clip_frames=4", "task.learning_rate=1e-3")
-TUNED_CLIPS = ("data.clip_frames=8", "task.learning_rate=2e-4", "task.rehearsal_weight=4")
 FRAMES, SCENES, BORDER = 16, 4, 8
-UNLABELLED = 16  # clips
+UNLABELLED, LONG = 16, 50  # clips without truth, and their frames
+
+
+class Form(NamedTuple):
+    """What a restorer of frames or of clips is trained with, and what it is fine-tuned with besides."""
+
+    trained: tuple[str, ...]
+    tuned: tuple[str, ...]
+
+
+OF_FRAMES = Form(
+    ("net=redegrading", "data.frames=4"),
+    ("data.clip_frames=4", "task.learning_rate=1e-3"),
+)
+OF_CLIPS = Form(
+    ("net=redegrading_clip", "data.frames=8"),
+    ("data.clip_frames=8", "task.learning_rate=2e-4", "task.rehearsal_weight=4"),
+)
 
 
 def main() -> int:
@@ -54,7 +70,14 @@ def main() -> int:
         "--real", nargs="+", type=Path, help="folders of clips to fine-tune on in place of simulated ones"
     )
     parser.add_argument("--kind", choices=KINDS, default="lens", help="of the clips without truth")
-    parser.add_argument("--clips", action="store_true", help="a restorer of clips, in place of one of single frames")
+    parser.add_argument(
+        "--clips",
+        dest="form",
+        action="store_const",
+        const=OF_CLIPS,
+        default=OF_FRAMES,
+        help="a restorer of clips, in place of one of single frames",
+    )
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
@@ -76,7 +99,7 @@ def main() -> int:
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
-        more += ["task.agree_weight=3", *(TUNED_CLIPS if options.clips else TUNED_FRAMES)]
+        more += ["task.agree_weight=3", *options.form.tuned]
         tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         mean = options.output / f"{options.kind}-{seed}" / "mean.ckpt"
@@ -95,9 +118,8 @@ def main() -> int:
 
 def trained(options: argparse.Namespace, name: str, epochs: int, arguments: list[str]) -> Path:
     """The last checkpoint of one training."""
-    of = ["net=redegrading_clip", "data.frames=8"] if options.clips else ["net=redegrading", "data.frames=4"]
     common = ["data.size=96", "data.steps_per_epoch=50", "data.moving=0"]
-    arguments = [*of, *common, *arguments, *options.overrides]
+    arguments = [*options.form.trained, *common, *arguments, *options.overrides]
     return train(options.output / name, epochs, options.pictures, options.threads, arguments)
 
 
@@ -111,7 +133,7 @@ def simulate(options: argparse.Namespace) -> Path:
         if not path.is_file():
             folder.mkdir(parents=True, exist_ok=True)
             picture = pictures(np.random.default_rng([7, number]), SIZE, SIZE)
-            write_clip(path, as_frames(made(maker, np.asarray(picture, np.float32), number).frames))
+            write_clip(path, as_frames(made(maker, np.asarray(picture, np.float32), number, LONG).frames))
     return folder
 
 
@@ -124,8 +146,8 @@ def scenes(where: dict[str, object]) -> Iterator[tuple[Tensor, np.ndarray]]:
         yield pair.frames, as_frames(pair.target)
 
 
-def made(maker: PairMaker, picture_HWC: np.ndarray, seed: int) -> Pair:
-    scene = torch.from_numpy(picture_HWC).permute(2, 0, 1).expand(1, FRAMES, 3, SIZE, SIZE)
+def made(maker: PairMaker, picture_HWC: np.ndarray, seed: int, frames: int = FRAMES) -> Pair:
+    scene = torch.from_numpy(picture_HWC).permute(2, 0, 1).expand(1, frames, 3, SIZE, SIZE)
     pair: Pair = maker(scene, [seed])
     return pair
 

@@ -1,8 +1,19 @@
-"""Clips without truth beside simulated ones with it, for self-supervised fine-tuning."""
+r"""Clips without truth beside simulated ones with it, for self-supervised fine-tuning.
+
+What a classical method makes of a whole clip stands where the scene is seen on average. A cut of a few frames shows it
+elsewhere, by the mean of their tilts :math:`\bar d`, which nobody can tell who has seen the cut alone; a network that had
+to say where the whole clip shows the scene would learn to blur by what it cannot know (`turbnet.data.pairs.Pair.settled`).
+So F is moved to where the cut shows it,
+
+.. math::
+    F'(x) = F(x - \bar d(x)), \qquad \bar d = \frac{1}{T} \sum_t d_t, \quad I_t(x + d_t(x)) \approx M(x)
+
+with the frames of the cut registered to M, the mean of the whole clip.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypedDict, final
+from typing import Any, NamedTuple, TypedDict, final
 
 import numpy as np
 import torch
@@ -10,7 +21,10 @@ from lightning.pytorch.utilities import CombinedLoader
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from turbnet.classical.local import Array
 from turbnet.classical.methods import Method, find_method
+from turbnet.classical.pipeline import REDUCTION
+from turbnet.classical.registration import register, warp
 from turbnet.data.footage import Footage, footage_paths
 from turbnet.data.module import ClipData
 from turbnet.errors import InputError, check_range
@@ -21,8 +35,29 @@ FUSED = 50
 """Frames of a clip that are fused, equally spaced where it has more."""
 
 
-def fused(path: Path, method: Method) -> Tensor:
-    """What a classical method makes of a clip of a still scene, (3, H, W), sRGB: the mean of its frames.
+class Whole(NamedTuple):
+    """What is known of all frames of a clip together, (H, W, 3).
+
+    Attributes:
+        mean: of the frames, linear intensities.
+        fused: what a classical method makes of them, sRGB.
+    """
+
+    mean: Array
+    fused: Array
+
+    def cut(self, top: int, left: int, height: int, width: int) -> "Whole":
+        """The same of a part of the picture."""
+        return Whole(*(picture[top : top + height, left : left + width] for picture in self))
+
+    def seen_by(self, frames_THWC: Array) -> Array:
+        """F', the fused picture where these sRGB frames of the clip show it on average, (H, W, 3)."""
+        _, shifts = register(to_linear(frames_THWC), self.mean, reduction=REDUCTION)
+        return warp(self.fused, -shifts.mean(0)).clip(0, 1)
+
+
+def whole_clip(path: Path, method: Method) -> Whole:
+    """A clip of a still scene through a classical method, whose frames are averaged.
 
     Raises:
         InputError: the clip cannot be read.
@@ -32,12 +67,12 @@ def fused(path: Path, method: Method) -> Tensor:
         chosen = set(np.linspace(0, count - 1, min(count, FUSED)).round().astype(int).tolist())
         frames = np.stack([to_linear(frame.clip(0, 1)) for index, frame in enumerate(clip) if index in chosen])
     clear = method(frames, torch.get_num_threads(), lambda share: None).mean(0)
-    return torch.from_numpy(to_srgb(clear.clip(0, 1)).astype(np.float32)).permute(2, 0, 1)
+    return Whole(frames.mean(0), to_srgb(clear.clip(0, 1)).astype(np.float32))
 
 
 @final
 class FusedCut(TypedDict):
-    """A `Scene` of a clip without truth, and "fused" (3, H, W), what was made of the whole clip."""
+    """A `Scene` of a clip without truth, and "fused" (3, H, W), what was made of the whole clip, as the cut shows it."""
 
     scene: Tensor
     seed: Tensor
@@ -46,21 +81,22 @@ class FusedCut(TypedDict):
 
 
 class Fused(Dataset[FusedCut]):
-    """Cuts of clips, each with the same place in what was made of the whole clip.
+    """Cuts of clips, each with what was made of the whole clip.
 
     Args:
         cuts: of the clips.
-        pictures: (3, H, W) for each clip.
+        wholes: of each clip.
     """
 
-    def __init__(self, cuts: Footage, pictures: dict[Path, Tensor]) -> None:
-        self.cuts, self.pictures = cuts, pictures
+    def __init__(self, cuts: Footage, wholes: dict[Path, Whole]) -> None:
+        self.cuts, self.wholes = cuts, wholes
 
     def __getitem__(self, index: int) -> FusedCut:
         path, _, top, left, _ = self.cuts.place(index)
-        picture = self.pictures[path][:, top : top + self.cuts.height, left : left + self.cuts.width]
         cut = self.cuts[index]
-        return {"scene": cut["scene"], "seed": cut["seed"], "hardness": cut["hardness"], "fused": picture}
+        whole = self.wholes[path].cut(top, left, self.cuts.height, self.cuts.width)
+        fused = torch.from_numpy(whole.seen_by(cut["scene"].permute(0, 2, 3, 1).numpy())).permute(2, 0, 1)
+        return {"scene": cut["scene"], "seed": cut["seed"], "hardness": cut["hardness"], "fused": fused}
 
 
 class UnlabelledData(ClipData):
@@ -85,7 +121,7 @@ class UnlabelledData(ClipData):
         self.cuts = Footage(paths, clip_frames, size, size, self.train.seed)
         # Another seed than training's, and the same whatever training's is.
         self.val_cuts = Footage(paths, clip_frames, size, size, 2**31 - 1)
-        self._fuse, self._pictures = find_method(fuse), dict[Path, Tensor]()
+        self._fuse, self._wholes = find_method(fuse), dict[Path, Whole]()
 
     def train_dataloader(self) -> Any:
         """Fresh cuts and scenes every epoch."""
@@ -99,7 +135,7 @@ class UnlabelledData(ClipData):
 
     def _cuts(self, cuts: Footage, sampler: Any) -> DataLoader[Any]:
         for path in cuts.paths:
-            if path not in self._pictures:
-                self._pictures[path] = fused(path, self._fuse)
-        data = Fused(cuts, self._pictures)
+            if path not in self._wholes:
+                self._wholes[path] = whole_clip(path, self._fuse)
+        data = Fused(cuts, self._wholes)
         return DataLoader(data, batch_size=self.batch_size, sampler=sampler, num_workers=self.workers)

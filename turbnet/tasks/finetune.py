@@ -19,8 +19,9 @@ class Finetuning(Redegradation):
         L = d(D(J_t, z_t), I_t) + d(D(J_t, z_s), I_s) + \lambda_f\, d(J_t, F) + \lambda_p\, \mathrm{prior}(z)
 
     What is particular to frame t, its noise and its tilt, is not in frame s. All frames must agree on F, what a classical
-    method makes of the whole clip: many frames know what one does not. The prior ties the blur to the dance of the frames.
-    Beside it the old lessons go on, on simulated pairs, so that nothing is forgotten.
+    method makes of the whole clip, where these frames show it (`turbnet.data.unlabelled`): many frames know what one does
+    not. The prior ties the blur to the dance of the frames. Beside it the old lessons go on, on simulated pairs, so that
+    nothing is forgotten.
 
     Args:
         agree_weight: lambda_f, of the distance of restored frames to F, which is that of the supervised loss.
