@@ -1,7 +1,8 @@
 """A sealed ONNX file with its dense convolutions in eight bits, quantised after training by onnxruntime's own tool.
 
-Weights by channel, activations by the range they have on a few clips; everything else stays in float32, the convolutions
-that go channel by channel too: they are the closed-form ones of deconvolution, and slow in eight bits.
+Weights by channel, activations by the range they have on a few clips; everything else stays in float32. So do convolutions
+that go channel by channel, which are the closed-form ones of deconvolution and slow in eight bits, and those into few
+channels: a picture, a tilt or weights come out of them, whose steps would be seen.
 """
 
 import logging
@@ -19,6 +20,9 @@ from turbnet.deploy.seal import UNSEALED
 from turbnet.deploy.session import INPUT, Model
 from turbnet.errors import InputError
 from turbnet.media.atomic import atomic_path
+
+FEW = 12
+"""Channels of the widest output that stays in float32: red, green and blue of 2 x 2 pixels."""
 
 
 class _Clips(CalibrationDataReader):
@@ -46,8 +50,6 @@ def write_eight_bits(source: Path, target: Path, clips: Iterable[np.ndarray]) ->
     card = Model.load(source).card
     if card.carried:
         raise InputError(f"{source} goes frame by frame; only networks that take windows are calibrated for eight bits")
-    nodes = onnx.load(source).graph.node
-    exact = [n.name for n in nodes if n.op_type == "Conv" and any(a.name == "group" and a.i > 1 for a in n.attribute)]
     log = logging.getLogger()
     level = log.level
     with atomic_path(target) as temporary:
@@ -60,7 +62,7 @@ def write_eight_bits(source: Path, target: Path, clips: Iterable[np.ndarray]) ->
                 quant_format=QuantFormat.QDQ,
                 per_channel=True,
                 op_types_to_quantize=["Conv"],
-                nodes_to_exclude=exact,
+                nodes_to_exclude=_exact(onnx.load(source).graph),
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
             )
@@ -68,3 +70,11 @@ def write_eight_bits(source: Path, target: Path, clips: Iterable[np.ndarray]) ->
             log.setLevel(level)
         notes = {"numbers": "dense convolutions in eight bits, all else float32", **card.notes}
         temporary.write_bytes(sealed(onnx.load(temporary), replace(card, sha256=UNSEALED, notes=notes)))
+
+
+def _exact(graph: onnx.GraphProto) -> list[str]:
+    """Names of the convolutions that stay in float32."""
+    outer = {weights.name: weights.dims[0] for weights in graph.initializer if weights.dims}
+    convolutions = [node for node in graph.node if node.op_type == "Conv"]
+    grouped = {n.name for n in convolutions if any(a.name == "group" and a.i > 1 for a in n.attribute)}
+    return [n.name for n in convolutions if n.name in grouped or outer.get(n.input[1], 0) <= FEW]
