@@ -117,7 +117,7 @@ def test_a_pipe_that_breaks_off_ends_the_clip(model, tmp_path, frames):
     ("arguments", "stream", "says"),
     [
         ("- -o out.mkv", b"", "cannot read standard input"),
-        ("- -o out.mkv", b"no video" * 1000, "cannot read standard input"),
+        ("- -o out.mkv", b"no video" * 1000, "cannot read standard input: no video that can be read as it comes"),
         ("- -o out.xyz", b"".join(y4m(range(3))), "unknown kind"),
         ("- -o out.mkv --crop 0,0,99,99", b"".join(y4m(range(3))), "does not lie inside -"),
     ],
@@ -129,6 +129,17 @@ def test_bad_streams_are_one_line(model, tmp_path, arguments, stream, says):
     assert done.stderr.count(b"\n") == 1, done.stderr
     assert says in done.stderr.decode()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_mp4_whose_index_comes_last_cannot_be_piped(model, tmp_path):
+    """But for a short one, that FFmpeg holds whole."""
+    write_clip(tmp_path / "clip.mp4", np.random.default_rng(0).random((8, 256, 256, 3), np.float32))
+    stream = (tmp_path / "clip.mp4").read_bytes()
+    words = command("-", "-o", tmp_path / "out.mkv", "--model", model)
+    done = subprocess.run(words, input=stream, capture_output=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.decode().endswith("Matroska can, an .mp4 only if its index is first\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
 
 
 def test_ctrl_c_ends_an_endless_clip_and_it_is_whole(model, tmp_path):

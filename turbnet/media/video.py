@@ -65,12 +65,20 @@ def _sound_packets(container: Any, path: Path) -> Iterator[Any]:
 def open_live_video(path: Path, threads: int | None, ended: Callable[[], bool]) -> Source:
     """A pipe or a camera, which can be passed over once."""
     name = Path("standard input") if path == STANDARD else path
-    with reading(name):
-        container = open_live(path, ended)
-        stream = _video_stream(container, name, threads)
-        sound = Sound(container) if container.streams.audio else None
-        following = _decode_live(container, sound, name, threads, ended)
-        first = next(following, None)
+    try:
+        with reading(name):
+            container = open_live(path, ended)
+            stream = _video_stream(container, name, threads)
+            sound = Sound(container) if container.streams.audio else None
+            following = _decode_live(container, sound, name, threads, ended)
+            first = next(following, None)
+    except InputError as error:
+        if isinstance(error.__cause__, av.InvalidDataError):
+            raise InputError(
+                f"cannot read {name}: no video that can be read as it comes; "
+                "Matroska can, an .mp4 only if its index is first"
+            ) from error
+        raise
     if first is None:
         raise InputError(f"{name} holds no video frame")
     height, width = first[1].shape[:2]
