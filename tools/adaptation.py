@@ -81,7 +81,7 @@ def main() -> int:
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
-    parser.add_argument("--before", type=float, default=0.2, help="share of the weights before in the mean")
+    parser.add_argument("--before", type=float, default=0.1, help="share of the weights before in the mean")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--output", type=Path, default=Path("outputs/adaptation"))
     parser.add_argument(
