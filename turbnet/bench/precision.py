@@ -1,7 +1,8 @@
 """Whether a network is worth running in eight bits.
 
 It is worth it if it is a tenth faster at least and loses a tenth of a decibel at most in scenes of every kind at D/r0 = 3
-that it was not calibrated on. Half precision is no question: onnxruntime has no kernels for it on a processor and would
+that it was not calibrated on, in windows as long as its card recommends: what runs once a window gains more by eight bits
+than what runs once a frame. Half precision is no question: onnxruntime has no kernels for it on a processor and would
 convert.
 """
 
@@ -12,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from turbnet.bench.suite import SUITES, make_clip
+from turbnet.bench.suite import LENGTHS, SUITES, make_clip
 from turbnet.deploy.eight_bits import write_eight_bits
-from turbnet.deploy.session import INPUT, available_cores, open_session
+from turbnet.deploy.session import INPUT, Model, available_cores, open_session
 from turbnet.metrics.fidelity import psnr
 from turbnet.report import Row
 
@@ -22,7 +23,8 @@ FASTER, LOSS = 1.1, 0.1
 """The least gain in speed and the greatest loss in dB at which eight bits are worth it."""
 
 KINDS = ("static", "dynamic", "text")
-FRAMES, STRENGTH, BORDER = 6, 3.0, 8
+FEWEST, STRENGTH, BORDER = 6, 3.0, 8
+"""Frames of a clip at least, D/r0, pixels left out."""
 
 
 @dataclass(frozen=True)
@@ -61,25 +63,31 @@ def measure(file: Path, quick: bool = False) -> list[Row]:
 
 
 def calibrated(source: Path, target: Path) -> Path:
-    """The network in eight bits, calibrated on the first still scene and the first text."""
-    write_eight_bits(source, target, (make_clip(kind, 0, STRENGTH, FRAMES).frames for kind in ("static", "text")))
+    """The network in eight bits, calibrated on the first scene of every kind."""
+    frames = _frames(source)
+    write_eight_bits(source, target, (make_clip(kind, 0, STRENGTH, frames).frames for kind in KINDS))
     return target
+
+
+def _frames(file: Path) -> int:
+    return min(max(Model.load(file).card.frames, FEWEST), max(LENGTHS))
 
 
 def judge(exact: Path, rounded: Path, quick: bool = False) -> Verdict:
     """The file of a network beside that of the same in eight bits, on this machine."""
     scenes = range(1, 2 if quick else SUITES["standard"].scenes)
+    frames = _frames(exact)
     sessions = [open_session(path.read_bytes(), available_cores()) for path in (exact, rounded)]
     losses, ratios = dict[str, float](), list[float]()
     for kind in KINDS:
         lost = []
         for scene in scenes:
-            clip = make_clip(kind, scene, STRENGTH, FRAMES)
-            frames = np.ascontiguousarray(clip.frames.transpose(0, 3, 1, 2)[None], np.float32)
+            clip = make_clip(kind, scene, STRENGTH, frames)
+            window = np.ascontiguousarray(clip.frames.transpose(0, 3, 1, 2)[None], np.float32)
             times, scores = [], []
             for session in sessions:
                 begun = time.perf_counter()
-                (restored,) = session.run(None, {INPUT: frames})
+                (restored,) = session.run(None, {INPUT: window})
                 times.append(time.perf_counter() - begun)
                 shown = restored[0].transpose(0, 2, 3, 1).clip(0, 1)
                 scores.append(float(psnr(shown, clip.target, BORDER).mean()))
