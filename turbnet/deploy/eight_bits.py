@@ -68,7 +68,7 @@ def write_eight_bits(source: Path, target: Path, clips: Iterable[np.ndarray]) ->
             )
         finally:
             log.setLevel(level)
-        notes = {"numbers": "dense convolutions in eight bits, all else float32", **card.notes}
+        notes = {"numbers": f"convolutions into more than {FEW} channels in eight bits, all else float32", **card.notes}
         temporary.write_bytes(sealed(onnx.load(temporary), replace(card, sha256=UNSEALED, notes=notes)))
 
 
