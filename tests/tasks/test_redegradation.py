@@ -162,7 +162,7 @@ def test_every_cut_comes_with_its_place_in_the_fused_picture(tmp_path):
     data = Fused(Footage(paths, 3, 32, 40, seed=3), {path: whole_clip(path, METHODS["mean"]) for path in paths})
     for index in range(6):
         cut = data[index]
-        torch.testing.assert_close(cut["fused"], cut["scene"][0], atol=2e-3, rtol=0)
+        torch.testing.assert_close(cut["fused"], cut["scene"][0], atol=1e-5, rtol=0)
 
 
 def test_the_fused_picture_is_where_the_cut_shows_it():

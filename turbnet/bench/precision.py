@@ -15,7 +15,7 @@ import numpy as np
 
 from turbnet.bench.suite import LENGTHS, SUITES, make_clip
 from turbnet.deploy.eight_bits import write_eight_bits
-from turbnet.deploy.session import INPUT, Model, available_cores, open_session
+from turbnet.deploy.session import Model
 from turbnet.metrics.fidelity import psnr
 from turbnet.report import Row
 
@@ -64,20 +64,16 @@ def measure(file: Path, quick: bool = False) -> list[Row]:
 
 def calibrated(source: Path, target: Path) -> Path:
     """The network in eight bits, calibrated on the first scene of every kind."""
-    frames = _frames(source)
+    frames = _frames(Model.load(source))
     write_eight_bits(source, target, (make_clip(kind, 0, STRENGTH, frames).frames for kind in KINDS))
     return target
-
-
-def _frames(file: Path) -> int:
-    return min(max(Model.load(file).card.frames, FEWEST), max(LENGTHS))
 
 
 def judge(exact: Path, rounded: Path, quick: bool = False) -> Verdict:
     """The file of a network beside that of the same in eight bits, on this machine."""
     scenes = range(1, 2 if quick else SUITES["standard"].scenes)
-    frames = _frames(exact)
-    sessions = [open_session(path.read_bytes(), available_cores()) for path in (exact, rounded)]
+    models = [Model.load(path) for path in (exact, rounded)]
+    frames = _frames(models[0])
     losses, ratios = dict[str, float](), list[float]()
     for kind in KINDS:
         lost = []
@@ -85,9 +81,9 @@ def judge(exact: Path, rounded: Path, quick: bool = False) -> Verdict:
             clip = make_clip(kind, scene, STRENGTH, frames)
             window = np.ascontiguousarray(clip.frames.transpose(0, 3, 1, 2)[None], np.float32)
             times, scores = [], []
-            for session in sessions:
+            for model in models:
                 begun = time.perf_counter()
-                (restored,) = session.run(None, {INPUT: window})
+                restored = model(window)
                 times.append(time.perf_counter() - begun)
                 shown = restored[0].transpose(0, 2, 3, 1).clip(0, 1)
                 scores.append(float(psnr(shown, clip.target, BORDER).mean()))
@@ -95,3 +91,8 @@ def judge(exact: Path, rounded: Path, quick: bool = False) -> Verdict:
             ratios.append(times[0] / times[1])
         losses[kind] = float(np.mean(lost))
     return Verdict(float(np.median(ratios)), losses)
+
+
+def _frames(model: Model) -> int:
+    """Frames of the window that the card recommends, as far as the benchmark has them."""
+    return min(max(model.card.frames, FEWEST), max(LENGTHS))
