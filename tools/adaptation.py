@@ -7,7 +7,8 @@ more noise, a lens out of focus, a blur with tails or much more noise, simulated
 files without their truth, once for each seed. Clips of both kinds over the still scenes of the benchmark, which neither saw,
 then tell what was gained and what was lost, by the weights as tuned and by their mean with those before (--before).
 Resumable: what is trained is not trained again. Prints a table and keeps it in --output. With --real FOLDER it does the same
-with clips of its own: there is no truth, so the re-degradation error and the residual jitter are measured.
+with clips of its own: there is no truth, so what is measured is the re-degradation error, by the frame a restored one came
+from and by another, and the residual jitter.
 """
 
 import argparse
@@ -109,7 +110,7 @@ def main() -> int:
         print({name: round(value, 4) for name, value in rows[f"mean, seed {seed}"].items()}, flush=True)
     lines = ["| network | " + " | ".join(rows["trained"]) + " |", "|---" * (1 + len(rows["trained"])) + "|"]
     for name, row in rows.items():
-        lines.append(f"| {name} | " + " | ".join(f"{v:.3f}" if v < 1 else f"{v:.2f}" for v in row.values()) + " |")
+        lines.append(f"| {name} | " + " | ".join(f"{v:.5f}" if v < 1 else f"{v:.2f}" for v in row.values()) + " |")
     print("\n".join(lines))
     with atomic_path(options.output / f"adaptation-{options.kind}.json") as temporary:
         temporary.write_text(json.dumps(rows, indent=2) + "\n")
@@ -178,8 +179,12 @@ def measure(
     for number, path in enumerate(footage_paths(real or [])):
         frames = torch.from_numpy(read_clip(path)[0][:FRAMES]).permute(0, 3, 1, 2)[None]
         height, width = (side // network.size_multiple * network.size_multiple for side in frames.shape[-2:])
-        found = network.stages(frames[..., :height, :width])
-        rows[f"clip {number}, re-degradation error"] = float(charbonnier(found.frames, frames[..., :height, :width]))
+        frames = frames[..., :height, :width]
+        found = network.stages(frames)
+        rows[f"clip {number}, re-degradation error"] = float(charbonnier(found.frames, frames))
+        # A restored frame may keep noise of its own frame, which explains that frame and no other.
+        others = network.degradation(found.restored.roll(frames.shape[1] // 2, dims=1), found.code)
+        rows[f"clip {number}, by another"] = float(charbonnier(others, frames))
         restored = as_frames(found.restored)
         rows[f"clip {number}, jitter"] = jitter(restored, restored.mean(0))
     return rows

@@ -20,8 +20,10 @@ class Finetuning(Redegradation):
 
     What is particular to frame t, its noise and its tilt, is not in frame s. All frames must agree on F, what a classical
     method makes of the whole clip, where these frames show it (`turbnet.data.unlabelled`): many frames know what one does
-    not. The prior ties the blur to the dance of the frames. Beside it the old lessons go on, on simulated pairs, so that
-    nothing is forgotten.
+    not. A restorer of clips can hold its frames still, so what they differ by, |J_t - mean J|, is added to the distance to
+    F: noise and dance of its own that a restored frame keeps explain its frame, and would pay in the first term. The prior
+    ties the blur to the dance of the frames. Beside it the old lessons go on, on simulated pairs, so that nothing is
+    forgotten.
 
     Args:
         agree_weight: lambda_f, of the distance of restored frames to F, which is that of the supervised loss.
@@ -48,6 +50,8 @@ class Finetuning(Redegradation):
         agree = charbonnier(restored, still) + self.hparams["frequency_weight"] * frequency_loss(restored, still)
         if scene is not None:
             agree = agree + self.hparams["scene_weight"] * charbonnier(scene, still[:, :1])
+            # Absolute: Charbonnier's epsilon is as large as what frames of a clip still differ by.
+            agree = agree + (restored - restored.mean(1, keepdim=True)).abs().mean()
         prior = net.degradation.prior(code)
         loss = own + cross + self.hparams["agree_weight"] * agree + self.hparams["prior_weight"] * prior
         return loss, {"redegraded": own, "cross": cross, "agree": agree, "prior": prior}
