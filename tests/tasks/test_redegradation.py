@@ -16,7 +16,7 @@ from turbnet.media.clip import write_clip
 from turbnet.media.colour import to_linear, to_srgb
 from turbnet.nets.restorer import Restorer
 from turbnet.nets.still import StillRestorer
-from turbnet.tasks.checkpoint import read_checkpoint
+from turbnet.tasks.checkpoint import load_net, read_checkpoint
 from turbnet.tasks.finetune import Finetuning
 from turbnet.tasks.fit import fit
 from turbnet.tasks.redegradation import Redegradation
@@ -164,6 +164,17 @@ def test_a_restorer_alone_can_be_started_from(tmp_path):
     torch.save({"hyper_parameters": {"net": RESTORER}, "state_dict": state}, tmp_path / "restorer.ckpt")
     task = make(Redegradation, start_from=str(tmp_path / "restorer.ckpt"))
     assert all((x == 0.5).all() for x in task.net.restorer.state_dict().values())
+
+
+def test_a_released_restorer_of_any_size_can_be_started_from():
+    from hydra import compose, initialize_config_module
+
+    with initialize_config_module("turbnet.configs", version_base="1.3"):
+        config = compose("train", overrides=["net=redegrading_clip", "net@net.restorer=s", "task=redegradation"])
+    net = OmegaConf.to_container(config.net)
+    task = Redegradation(net=net, simulator=SIMULATOR, start_from="s")
+    released = load_net("s", net["restorer"])
+    assert all(torch.equal(x, released[name]) for name, x in task.net.restorer.state_dict().items())
 
 
 def test_every_cut_comes_with_its_place_in_the_fused_picture(tmp_path):
