@@ -1,6 +1,7 @@
 """A sealed ONNX file with its dense convolutions in eight bits, quantised after training by onnxruntime's own tool.
 
-Weights by channel, activations by the range they have on a few clips; everything else stays in float32. So do convolutions
+Weights by channel and in seven bits, so that sums of two products fit into the sixteen bits that processors without VNNI
+have for them; activations by the range they have on a few clips; everything else stays in float32. So do convolutions
 that go channel by channel, which are the closed-form ones of deconvolution and slow in eight bits, and those into few
 channels: a picture, a tilt or weights come out of them, whose steps would be seen.
 """
@@ -61,6 +62,7 @@ def write_eight_bits(source: Path, target: Path, clips: Iterable[np.ndarray]) ->
                 _Clips(clips),
                 quant_format=QuantFormat.QDQ,
                 per_channel=True,
+                reduce_range=True,
                 op_types_to_quantize=["Conv"],
                 nodes_to_exclude=_exact(onnx.load(source).graph),
                 activation_type=QuantType.QUInt8,
