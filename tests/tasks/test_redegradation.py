@@ -43,6 +43,13 @@ def make(kind, form="linear", restorer=RESTORER, **more):
     return task
 
 
+def untold(task, batch):
+    """The pair of a batch as a clip without truth, its fused picture perfect, beside the batch itself."""
+    pair = task.pair(batch)
+    clip = {"scene": pair.frames, "fused": pair.target[:, 0], "seed": batch["seed"], "hardness": batch["hardness"]}
+    return {"clips": clip, "scenes": batch}
+
+
 @pytest.mark.parametrize("form", ["linear", "physical"])
 def test_it_learns_one_clip_by_heart(form, batch, learn):
     task = make(Redegradation, form)
@@ -57,9 +64,7 @@ def test_it_learns_one_clip_by_heart(form, batch, learn):
 def test_without_truth_it_learns_to_give_what_was_seen(form, batch, learn):
     """A few steps on one clip: what was restored explains it better, by a likelier blur, and agrees more; the old stays."""
     task = make(Finetuning, form)
-    pair = task.pair(batch)
-    clip = {"scene": pair.frames, "fused": pair.target[:, 0], "seed": batch["seed"], "hardness": batch["hardness"]}
-    learn(task, {"clips": clip, "scenes": batch}, 40, 2e-3)
+    learn(task, untold(task, batch), 40, 2e-3)
     first, last = task.seen[0], task.seen[-1]
     for name in ("unsupervised", "agree", "old_charbonnier"):
         assert last[name] < first[name], name
@@ -75,9 +80,7 @@ def test_the_still_scene_of_a_restorer_of_clips_has_a_loss_of_its_own(kind, batc
         restorer = task.net.restorer
         with torch.no_grad():
             restorer.own.head.bias[-4:] = 40.0
-        pair = task.pair(batch)
-        clip = {"scene": pair.frames, "fused": pair.target[:, 0], "seed": batch["seed"], "hardness": batch["hardness"]}
-        task.training_step({"clips": clip, "scenes": batch} if kind is Finetuning else batch, 0).backward()
+        task.training_step(untold(task, batch) if kind is Finetuning else batch, 0).backward()
         moves[weight] = sum(float(p.grad.abs().max()) for p in restorer.scene.parameters() if p.grad is not None)
     assert moves[0.0] < 1e-6 < 1e-3 < moves[0.6]
 
@@ -85,12 +88,11 @@ def test_the_still_scene_of_a_restorer_of_clips_has_a_loss_of_its_own(kind, batc
 def test_frames_of_a_still_scene_come_to_agree(batch, learn):
     """Of what each has of its own, noise and dance, 3 % is left, and 24 % where only the fused picture makes them agree."""
     task = make(Finetuning, restorer=CLIP_RESTORER)
-    pair = task.pair(batch)
-    clip = {"scene": pair.frames, "fused": pair.target[:, 0], "seed": batch["seed"], "hardness": batch["hardness"]}
+    both = untold(task, batch)
     spread = []
     for steps in (0, 40):
-        learn(task, {"clips": clip, "scenes": batch}, steps, 2e-3)
-        spread.append(float(task.net(pair.frames).detach().std(1).mean()))
+        learn(task, both, steps, 2e-3)
+        spread.append(float(task.net(both["clips"]["scene"]).detach().std(1).mean()))
     assert spread[1] < 0.1 * spread[0]
 
 
