@@ -79,6 +79,7 @@ def main() -> int:
         default=OF_FRAMES,
         help="a restorer of clips, in place of one of single frames",
     )
+    parser.add_argument("--start", help="with --clips: the released network that the restorer starts from")
     parser.add_argument("--epochs", type=int, default=30, help="of 50 steps, with truth")
     parser.add_argument("--tuning", type=int, default=6, help="epochs of 50 steps, without truth")
     parser.add_argument("--seeds", type=int, default=5, help="how many fine-tunings")
@@ -92,7 +93,8 @@ def main() -> int:
     torch.set_num_threads(options.threads)
 
     old = [f"simulator.{name}={value}" for name, value in OLD.items()]
-    first = trained(options, "trained", options.epochs, ["task=redegradation", *old])
+    start = [f"task.start_from={options.start}", "task.learning_rate=5e-4"] if options.start else []
+    first = trained(options, "trained", options.epochs, ["task=redegradation", *old, *start])
     unlabelled = options.real or [simulate(options)]
     before = load(first)
     clips = {name: list(scenes(where)) for name, where in (("old", OLD), ("new", KINDS[options.kind]))}
@@ -100,6 +102,7 @@ def main() -> int:
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
+        more.append(f"data.fused={options.output.resolve() / 'fused'}")
         more += ["task.agree_weight=3", *options.form.tuned]
         tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
@@ -119,7 +122,9 @@ def main() -> int:
 
 def trained(options: argparse.Namespace, name: str, epochs: int, arguments: list[str]) -> Path:
     """The last checkpoint of one training."""
-    common = ["data.size=96", "data.steps_per_epoch=50", "data.moving=0"]
+    common = ["data.size=96", "data.steps_per_epoch=50"]
+    if not options.start:  # what has learned how scenes move is to keep it
+        common.append("data.moving=0")
     arguments = [*options.form.trained, *common, *arguments, *options.overrides]
     return train(options.output / name, epochs, options.pictures, options.threads, arguments)
 

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from turbnet.classical.methods import METHODS
 from turbnet.data.footage import Footage, footage_paths
 from turbnet.data.pairs import Pair, PairMaker
-from turbnet.data.unlabelled import Fused, Whole, whole_clip
+from turbnet.data.unlabelled import Fused, Whole, kept_whole, whole_clip
 from turbnet.deploy.checkpoint import load_network
 from turbnet.errors import InputError
 from turbnet.media.clip import write_clip
@@ -154,9 +154,11 @@ def test_pre_training_then_fine_tuning_as_a_user_does(run, clips, net, name, kin
     restorer, hyper = load_network(tuned / "checkpoints/last.ckpt")
     assert isinstance(restorer, kind)  # to run and to export
     assert hyper["net"]["name"] == name
-    again = run("again", *more, f"task.start_from={start}")
-    same = read_checkpoint(again / "checkpoints/last.ckpt")["state_dict"]
-    assert all(torch.equal(after[part], same[part]) for part in after)
+    again = run("again", *more, f"task.start_from={start}", "callbacks.checkpoint.save_top_k=-1")
+    resumed = run("resumed", *more, f"task.start_from={start}", f"resume={again}/checkpoints/epoch0000.ckpt")
+    for other in (again, resumed):
+        same = read_checkpoint(other / "checkpoints/last.ckpt")["state_dict"]
+        assert all(torch.equal(after[part], same[part]) for part in after)
 
 
 def test_a_restorer_alone_can_be_started_from(tmp_path):
@@ -230,6 +232,25 @@ def test_of_a_long_clip_some_frames_are_fused(tmp_path):
     whole = whole_clip(tmp_path / "ramp.mkv", METHODS["mean"])
     assert abs(float(whole.fused.mean()) - float(expected)) < 0.01
     assert abs(float(whole.mean.mean()) - float(to_linear(ramp[:, 0, 0, 0]).mean())) < 0.01
+
+
+def test_the_picture_of_a_whole_clip_is_made_once(tmp_path, capsys):
+    """Of the same clip by the same method, wherever it lies; a damaged one is said to be."""
+    kept, picture = tmp_path / "kept", skimage.data.astronaut()[40:72, 100:140].astype(np.float32) / 255
+    folders = [tmp_path / name for name in ("first", "second", "darker")]
+    for folder, level in zip(folders, (1, 1, 0.5), strict=True):
+        write_clip(folder, np.broadcast_to(level * picture, (3, 32, 40, 3)))
+    wholes = [kept_whole(kept, folder, "mean") for folder in folders]
+    assert capsys.readouterr().out == "fusing the frames of first\nfusing the frames of darker\n"
+    for found, made in zip(wholes, (whole_clip(folder, METHODS["mean"]) for folder in folders), strict=True):
+        assert all(np.array_equal(*parts) for parts in zip(found, made, strict=True))
+    kept_whole(kept, folders[0], "optical-flow")
+    files = list(kept.iterdir())
+    assert len(files) == 3
+    for file in files:
+        file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(InputError, match="cannot read .*npy"):
+        kept_whole(kept, folders[0], "mean")
 
 
 def test_clips_that_cannot_be_used(run, clips, tmp_path):

@@ -11,6 +11,7 @@ So F is moved to where the cut shows it,
 with the frames of the cut registered to M, the mean of the whole clip.
 """
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, final
@@ -21,6 +22,7 @@ from lightning.pytorch.utilities import CombinedLoader
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from turbnet._version import __version__
 from turbnet.classical.local import Array
 from turbnet.classical.methods import Method, find_method
 from turbnet.classical.pipeline import REDUCTION
@@ -28,8 +30,10 @@ from turbnet.classical.registration import register, warp
 from turbnet.data.footage import Footage, footage_paths
 from turbnet.data.module import ClipData
 from turbnet.errors import InputError, check_range
+from turbnet.media.atomic import atomic_path
 from turbnet.media.clip import open_clip
 from turbnet.media.colour import to_linear, to_srgb
+from turbnet.media.guard import reading
 
 FUSED = 50
 """Frames of a clip that are fused, equally spaced where it has more."""
@@ -48,7 +52,7 @@ class Whole(NamedTuple):
 
     def cut(self, top: int, left: int, height: int, width: int) -> "Whole":
         """The same of a part of the picture."""
-        return Whole(*(picture[top : top + height, left : left + width] for picture in self))
+        return Whole(*(np.array(picture[top : top + height, left : left + width]) for picture in self))
 
     def seen_by(self, frames_THWC: Array) -> Array:
         """F', the fused picture where these sRGB frames of the clip show it on average, (H, W, 3)."""
@@ -68,6 +72,27 @@ def whole_clip(path: Path, method: Method) -> Whole:
         frames = np.stack([to_linear(frame.clip(0, 1)) for index, frame in enumerate(clip) if index in chosen])
     clear = method(frames, torch.get_num_threads(), lambda share: None).mean(0)
     return Whole(frames.mean(0), to_srgb(clear.clip(0, 1)).astype(np.float32))
+
+
+def kept_whole(folder: Path, path: Path, fuse: str) -> Whole:
+    """`whole_clip` by a method of this name, made once: a file in `folder`, named after what it was made of, holds it.
+
+    Raises:
+        InputError: the clip cannot be read, there is no such method, or the folder cannot be written.
+    """
+    made_of = hashlib.sha256(f"{__version__} {fuse} {FUSED}".encode())
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            with file.open("rb") as data:
+                made_of.update(f"\0{file.relative_to(path)}\0".encode() + hashlib.file_digest(data, "sha256").digest())
+    kept = folder / f"{made_of.hexdigest()}.npy"
+    if not kept.is_file():
+        print(f"fusing the frames of {path.name}", flush=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(kept) as temporary:
+            np.save(temporary, np.stack(whole_clip(path, find_method(fuse))), allow_pickle=False)
+    with reading(kept):
+        return Whole(*np.load(kept, mmap_mode="r", allow_pickle=False))
 
 
 @final
@@ -106,13 +131,16 @@ class UnlabelledData(ClipData):
         clips: folders of the user's clips of still scenes: videos, GIFs, folders of images.
         clip_frames: frames of a cut.
         fuse: classical method whose picture of the whole clip goes with every cut; it is made once, before training.
+        fused: folder where these pictures are kept, for whoever goes on with a training or starts another.
         more: see `ClipData`; `size`, `batch_size` and `seed` are those of the cuts as well.
 
     Raises:
         InputError: no such method, no clips, clips that are too short or small, and as `ClipData`.
     """
 
-    def __init__(self, clips: Sequence[str], clip_frames: int = 6, fuse: str = "pipeline", **more: Any) -> None:
+    def __init__(
+        self, clips: Sequence[str], fused: str, clip_frames: int = 6, fuse: str = "pipeline", **more: Any
+    ) -> None:
         super().__init__(**more)
         if isinstance(clips, str):
             raise InputError(f"clips = {clips!r} must be a list, such as [{clips}]")
@@ -121,7 +149,8 @@ class UnlabelledData(ClipData):
         self.cuts = Footage(paths, clip_frames, size, size, self.train.seed)
         # Another seed than training's, and the same whatever training's is.
         self.val_cuts = Footage(paths, clip_frames, size, size, 2**31 - 1)
-        self._fuse, self._wholes = find_method(fuse), dict[Path, Whole]()
+        find_method(fuse)  # before anything is long at work
+        self._fuse, self._fused, self._wholes = fuse, Path(fused), dict[Path, Whole]()
 
     def train_dataloader(self) -> Any:
         """Fresh cuts and scenes every epoch."""
@@ -136,6 +165,6 @@ class UnlabelledData(ClipData):
     def _cuts(self, cuts: Footage, sampler: Any) -> DataLoader[Any]:
         for path in cuts.paths:
             if path not in self._wholes:
-                self._wholes[path] = whole_clip(path, self._fuse)
+                self._wholes[path] = kept_whole(self._fused, path, self._fuse)
         data = Fused(cuts, self._wholes)
         return DataLoader(data, batch_size=self.batch_size, sampler=sampler, num_workers=self.workers)
