@@ -9,7 +9,7 @@ import torch
 
 from turbnet.data.pairs import PairMaker
 from turbnet.deploy.restore import restore_frames
-from turbnet.deploy.skipping import ENOUGH, STILL, Skipped, Skipping, dance
+from turbnet.deploy.skipping import ENOUGH, STILL, Skipped, Skipping, around, dance
 from turbnet.deploy.tiling import Tiling
 
 SIZE = 96
@@ -141,6 +141,53 @@ def test_only_what_changes_is_restored_again(scene, corner):
     np.testing.assert_allclose(out[place], frames[place], atol=1e-6)
     far = np.ptp(out[30:], axis=0).max(-1)
     assert np.mean(far < 1e-6) > 0.3  # settled
+
+
+def test_a_camera_that_changes_its_exposure_shows_the_same_background(scene):
+    """A fifth darker and lighter again: no block is seen anew, and the background is as light as each frame."""
+    exposure = 0.9 + 0.1 * np.cos(np.arange(60) / 8)
+    frames, skipped = (exposure[:, None, None, None] * seen(scene, 1.0, 60)).astype(np.float32), Skipped()
+    out = through(frames, skipped, network=lambda x: x)
+    assert skipped.restored == pytest.approx(ENOUGH)
+    assert skipped.still >= 3
+    levels = out[30:].mean((1, 2, 3)) / frames[30:].mean((1, 2, 3))
+    np.testing.assert_allclose(levels, 1, atol=0.02)  # the air alone moves the means of blocks by as much
+    still = out[30:] / exposure[30:, None, None, None]
+    assert np.sqrt(still.var(0).mean()) < 0.2 * np.sqrt((frames / exposure[:, None, None, None]).var(0).mean())
+
+
+@pytest.mark.parametrize("kind", ["exposure", "another scene"])
+def test_what_changes_everywhere_does_not_look_still(scene, kind):
+    """Weak gradients then vary as strong ones do, as they would in clear air."""
+    frames = seen(scene, 1.0, 24)
+    if kind == "exposure":
+        frames = frames * np.linspace(1, 0.5, 24, dtype=np.float32)[:, None, None, None]
+    else:
+        frames[8:16] = frames[8:16, ::-1, ::-1]
+    skipped = Skipped()
+    through(frames, skipped)
+    assert skipped.clean == 0
+
+
+def test_rectangles_hold_what_has_changed_and_little_else():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        sides = tuple(int(side) for side in 8 * rng.integers(8, 60, 2))
+        changed = np.zeros([side // 16 for side in sides], bool)
+        for row, column in zip(*(rng.integers(0, n, 3) for n in changed.shape), strict=True):
+            changed[row, column : column + 3] = True
+        boxes, seen = around(changed, sides, 8), np.zeros(sides, bool)
+        for down, across in boxes:
+            assert not any(end % 8 for part in (down, across) for end in (part.start, part.stop))
+            seen[down, across] = True
+        for row, column in np.argwhere(changed):  # with 32 pixels around each block; the last one takes what is left
+            bottom = sides[0] if row == changed.shape[0] - 1 else 16 * row + 48
+            right = sides[1] if column == changed.shape[1] - 1 else 16 * column + 48
+            assert seen[max(16 * row - 32, 0) : bottom, max(16 * column - 32, 0) : right].all()
+    assert around(np.zeros((4, 4), bool), (64, 64), 8) == []
+    corners = np.zeros((30, 30), bool)
+    corners[0, 0] = corners[-1, -1] = True
+    assert len(around(corners, (480, 480), 8)) == 2
 
 
 def test_frames_alone_are_restored(scene):

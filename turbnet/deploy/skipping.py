@@ -14,15 +14,19 @@ expects less than 1.5 levels of 255 (but for one pixel in 200), the frame passes
 
 **Nothing has changed.** A still background is restored in two windows, and their mean, which dances less than either, stands
 for all that follow. A block of 16 x 16 pixels shows it where its means are, all through a window, what they were when it was
-first restored, as far as they fluctuate; what passes before it does not wipe it out, what comes to stay does. The network
-sees rectangles around the blocks that do not show it or have not been restored often enough, with 32 pixels around them;
-what changes fades into the background over 16.
+first restored, as far as they fluctuate; what passes before it does not wipe it out, what comes to stay does. The
+network sees rectangles around the blocks that do not show it or have not been restored often enough, with 32 pixels around
+them; what changes fades into the background over 16. Cameras change their exposure with what stands before them
+(`turbnet.deploy.exposure`): the means of blocks are compared without it, and the background is shown as each frame was
+exposed.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
+from turbnet.deploy.exposure import exposures
 
 STILL = 0.1
 """RMS displacement, pixels, below which air does not matter."""
@@ -33,9 +37,12 @@ ENOUGH = 2
 _LOOKED_AT = 12  # frames of a window, equally spaced, that tell the dance
 _BLOCK = 16
 _AROUND = 32  # pixels of context around what has changed
+_FADING = 8  # the outermost of them show nothing
+_CALL = 32**2  # pixels that would take as long as a rectangle of its own takes beside its pixels
 _CHANGE = 0.010  # of a block's mean, full scale 1
 _SLOPES = 2.0  # how much steeper a picture is than its mean over time
 _FLUCTUATION = 3.5  # standard errors
+_CHANCE = 0.05  # by which two medians of the same variance may differ
 _QUIET = 0.75 / 255  # RMS: the last bit of eight
 _EXPECTED, _RARE = 1.5 / 255, 0.995
 
@@ -105,14 +112,18 @@ class Skipping:
             self.skipped.restored += 1
             return self._network(frames_BTCHW)
         grey = frames.mean(1)
-        moved = dance(grey[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))])
+        means = block_means(grey)
+        few = np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).round().astype(int))
+        moved = dance(exposures(np.median(means[few], axis=0), means[few]).taken_out(grey[few]))
         if moved < STILL:
             self._kept[turn] = None
             self.skipped.clean += 1
             return frames_BTCHW
         kept, sides = self._kept[turn], frames.shape[2:]
         moved = min(moved, kept.dance) if kept else moved
-        means, spread = _blocks(grey)
+        exposure = exposures(kept.means if kept else np.median(means, axis=0), means)
+        means = exposure.taken_out(means)
+        spread = _fluctuation(means)
         # Only what stands still all the time stands for what comes; air moves the slopes of a picture as far as it dances.
         slopes = block_means(np.hypot(*np.gradient(grey.mean(0)))[None])[0]
         calm = spread < _CHANGE + _SLOPES * moved * np.minimum(slopes, 1 / _BLOCK)
@@ -130,18 +141,23 @@ class Skipping:
         if kept is None or share == 1:
             fresh = self._network(frames_BTCHW)
         else:
-            fresh = np.repeat(kept.picture[None, None], len(frames), axis=1)
+            fresh = exposure.shown(kept.picture)[None]
             for box in boxes:
-                fresh[..., *box] = self._network(np.ascontiguousarray(frames_BTCHW[..., *box]))
+                seen = self._network(np.ascontiguousarray(frames_BTCHW[..., *box]))
+                (down, from_top), (across, from_left) = (
+                    _shown(part, side) for part, side in zip(box, sides, strict=True)
+                )
+                fresh[..., down, across] = seen[..., from_top, from_left]
+        mean = exposure.mean(fresh[0])
         if kept is None:
-            self._kept[turn] = _Kept(means.mean(0), spread, steady, windows + 1, fresh.mean(1)[0], moved)
+            self._kept[turn] = _Kept(means.mean(0), spread, steady, windows + 1, mean, moved)
             return fresh
         # What passes by does not wipe out the background that it hides; what has come to stay does.
         passing = ~known & ~steady & kept.steady
         replaced = ~known & ~passing
         gains = np.where(known & (windows < ENOUGH), 1 / (windows + 1), 0)
         counts = np.maximum(_at_pixels((replaced | _neighbours(replaced)) & ~passing, sides), _at_pixels(gains, sides))
-        picture = kept.picture + counts * (fresh.mean(1)[0] - kept.picture)
+        picture = kept.picture + counts * (mean - kept.picture)
         self._kept[turn] = _Kept(
             np.where(replaced, means.mean(0), kept.means),
             np.where(replaced, spread, kept.spread),
@@ -151,29 +167,55 @@ class Skipping:
             moved,
         )
         changes = _at_pixels(~known | _neighbours(~known), sides)
-        out: np.ndarray = picture + changes * (fresh - picture)
-        return out
+        background = exposure.shown(picture)
+        fresh[0] -= background
+        fresh[0] *= changes
+        fresh[0] += background
+        return fresh
 
 
 def around(changed_hw: np.ndarray, sides: tuple[int, int], multiple: int) -> list[tuple[slice, slice]]:
-    """Rectangles around the blocks that have changed and what surrounds them, as large as a network takes them."""
-    found: list[tuple[int, int, int, int]] = []
-    ends = [[*_starts(side)[1:], side] for side in sides]
-    for row, column in np.argwhere(changed_hw):
-        top, left = max(row * _BLOCK - _AROUND, 0), max(column * _BLOCK - _AROUND, 0)
-        bottom, right = min(ends[0][row] + _AROUND, sides[0]), min(ends[1][column] + _AROUND, sides[1])
-        apart = []
-        for other in found:
-            if other[0] < bottom and top < other[1] and other[2] < right and left < other[3]:
-                top, bottom = min(top, other[0]), max(bottom, other[1])
-                left, right = min(left, other[2]), max(right, other[3])
-            else:
-                apart.append(other)
-        found = [*apart, (top, bottom, left, right)]
-    return [
-        (_multiple(top, bottom, sides[0], multiple), _multiple(left, right, sides[1], multiple))
-        for top, bottom, left, right in found
-    ]
+    """Rectangles around the blocks that have changed and what surrounds them, as large as a network takes them.
+
+    One around all of them is cut in two, and those again, while that leaves fewer pixels. They may overlap.
+    """
+    ends = [np.array([*_starts(side)[1:], side]) for side in sides]
+
+    def rectangle(blocks_N2: np.ndarray) -> tuple[slice, slice]:
+        first, last = blocks_N2.min(0), blocks_N2.max(0)
+        down, across = (
+            _multiple(max(f * _BLOCK - _AROUND, 0), min(end[k] + _AROUND, side), side, multiple)
+            for f, k, end, side in zip(first, last, ends, sides, strict=True)
+        )
+        return down, across
+
+    def cut(blocks_N2: np.ndarray) -> list[tuple[slice, slice]]:
+        whole, parts = rectangle(blocks_N2), None
+        least = _cost(whole)
+        for places in blocks_N2.T:
+            for place in np.unique(places)[1:]:
+                halves = blocks_N2[places < place], blocks_N2[places >= place]
+                cost = sum(_cost(rectangle(half)) for half in halves)
+                if cost < least:
+                    least, parts = cost, halves
+        return [whole] if parts is None else [*cut(parts[0]), *cut(parts[1])]
+
+    blocks = np.argwhere(changed_hw)
+    return cut(blocks) if len(blocks) else []
+
+
+def _cost(box: tuple[slice, slice]) -> int:
+    down, across = box
+    return (down.stop - down.start) * (across.stop - across.start) + _CALL
+
+
+def _shown(part: slice, side: int) -> tuple[slice, slice]:
+    """Where a part of an axis shows something, in the frame and in the part.
+
+    Not at its outermost pixels, which see too little around them, unless the frame ends there.
+    """
+    first, end = _FADING * (part.start > 0), part.stop - part.start - _FADING * (part.stop < side)
+    return slice(part.start + first, part.start + end), slice(first, end)
 
 
 def _multiple(first: int, end: int, side: int, multiple: int) -> slice:
@@ -202,6 +244,9 @@ def _at_pixels(blocks_hw: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
 def dance(frames_THW: np.ndarray) -> float:
     """RMS displacement of what stands still, in each axis, pixels; 0 where no frame differs from the others.
 
+    Infinite in place of next to nothing where weak gradients vary so much, by noise or by what moves of itself, that nothing
+    can be told.
+
     Args:
         frames_THW: grey, two frames or more.
     """
@@ -219,8 +264,9 @@ def dance(frames_THW: np.ndarray) -> float:
     weak, strong = np.quantile(steepness, (0.5, 0.9))
     if strong <= 0:
         return np.inf
-    moved = np.median(variance[steepness >= strong]) - np.median(variance[steepness <= weak])
-    return float(np.sqrt(max(moved, 0.0) / np.median(steepness[steepness >= strong])))
+    noise, slope = np.median(variance[steepness <= weak]), np.median(steepness[steepness >= strong])
+    moved = float(np.sqrt(max(np.median(variance[steepness >= strong]) - noise, 0.0) / slope))
+    return np.inf if moved < STILL and noise * _CHANCE > STILL**2 * slope else moved
 
 
 def _starts(side: int) -> list[int]:
@@ -228,13 +274,10 @@ def _starts(side: int) -> list[int]:
     return list(range(0, max(side - _BLOCK, 0) + 1, _BLOCK))
 
 
-def _blocks(frames_THW: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of blocks of every frame, (T, h, w), and how much they fluctuate, (h, w).
-
-    The standard deviation, from the median difference of successive frames: what comes and goes makes a few of them large.
-    """
-    means = block_means(frames_THW)
-    return means, np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.954
+def _fluctuation(means_Thw: np.ndarray) -> np.ndarray:
+    """Standard deviation over time (h, w), from the median difference of successive frames: few are large as things pass."""
+    deviation: np.ndarray = np.median(np.abs(np.diff(means_Thw, axis=0)), axis=0) / 0.954
+    return deviation
 
 
 def block_means(pictures_NHW: np.ndarray) -> np.ndarray:
