@@ -102,8 +102,7 @@ def main() -> int:
     for seed in range(options.seeds):
         folders = ",".join(str(folder.resolve()) for folder in unlabelled)
         more = ["task=finetune", "data=clips", f"data.clips=[{folders}]", f"task.start_from={first}", *old]
-        more.append(f"data.fused={options.output.resolve() / 'fused'}")
-        more += ["task.agree_weight=3", *options.form.tuned]
+        more += [f"data.fused={options.output.resolve() / 'fused'}", "task.agree_weight=3", *options.form.tuned]
         tuned = trained(options, f"{options.kind}-{seed}", options.tuning, [*more, f"seed={seed}"])
         rows[f"fine-tuned, seed {seed}"] = measure(load(tuned), clips, options.real)
         mean = options.output / f"{options.kind}-{seed}" / "mean.ckpt"

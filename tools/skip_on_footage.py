@@ -43,9 +43,8 @@ def main() -> int:
     model = Model.load(find_model(options.model))
     if options.bound:
         for name, fitted in (("as it is", False), ("exposure fitted", True)):
-            print(
-                f"{name}: at most {bound(clean.mean(-1), window_of(model), model.card.size_multiple, fitted):.2f} x as fast"
-            )
+            faster = bound(clean.mean(-1), window_of(model), model.card.size_multiple, fitted)
+            print(f"{name}: at most {faster:.2f} x as fast")
         return 0
     frames, skipped = through_air(clean, options.strength), Skipped()
     (whole, seconds), (spared, fewer) = restored(frames, model), restored(frames, model, skipped)

@@ -169,6 +169,16 @@ def test_what_changes_everywhere_does_not_look_still(scene, kind):
     assert skipped.clean == 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_where_no_dance_can_be_told_all_is_restored_and_nothing_kept():
+    """A flat picture of which a third flickers has no slopes that a dance could be seen by."""
+    frames, skipped = np.full((36, SIZE, SIZE, 3), 0.5, np.float32), Skipped()
+    frames[::2, :, : SIZE // 3], frames[1::2, :, : SIZE // 3] = 0.3, 0.7
+    assert dance(frames[:12].mean(-1)) == np.inf
+    np.testing.assert_allclose(through(frames, skipped), 0.5 * frames, atol=1e-6)
+    assert skipped.clean == skipped.still == 0
+
+
 def test_rectangles_hold_what_has_changed_and_little_else():
     rng = np.random.default_rng(0)
     for _ in range(20):

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+LAST_BIT = 0.75 / 255
+"""Of eight, full scale 1: what varies by less does not show."""
+
 _FLAT = 0.01**2  # variance of the means of blocks of a scene that tells no slope
-_SEEN = 0.75 / 255  # median departure, full scale 1
 
 
 @dataclass(frozen=True)
@@ -63,5 +65,5 @@ def exposures(expected_hw: np.ndarray, means_Thw: np.ndarray) -> Exposure:
         level = mean - slope * middle
         weights = 1 / (np.abs(y - slope * x - level) + 1e-3)
     before, after = (np.median(np.abs(y - fit), axis=1, keepdims=True) for fit in (x, slope * x + level))
-    other = (before > _SEEN) & (after < 0.7 * before) & (slope > 0.5) & (slope < 2)
+    other = (before > LAST_BIT) & (after < 0.7 * before) & (slope > 0.5) & (slope < 2)
     return Exposure(np.where(other, slope, 1)[..., None], np.where(other, level, 0)[..., None])

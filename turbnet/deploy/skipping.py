@@ -14,9 +14,9 @@ expects less than 1.5 levels of 255 (but for one pixel in 200), the frame passes
 
 **Nothing has changed.** A still background is restored in two windows, and their mean, which dances less than either, stands
 for all that follow. A block of 16 x 16 pixels shows it where its means are, all through a window, what they were when it was
-first restored, as far as they fluctuate; what passes before it does not wipe it out, what comes to stay does. The
-network sees rectangles around the blocks that do not show it or have not been restored often enough, with 32 pixels around
-them; what changes fades into the background over 16. Cameras change their exposure with what stands before them
+first restored, as far as they fluctuate; what passes before it does not wipe it out, what comes to stay does. The network
+sees rectangles around the blocks that do not show it or have not been restored often enough, with 32 pixels around them;
+what changes fades into the background over 16. Cameras change their exposure with what stands before them
 (`turbnet.deploy.exposure`): the means of blocks are compared without it, and the background is shown as each frame was
 exposed.
 """
@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from turbnet.deploy.exposure import exposures
+from turbnet.deploy.exposure import LAST_BIT, exposures
 
 STILL = 0.1
 """RMS displacement, pixels, below which air does not matter."""
@@ -43,7 +43,6 @@ _CHANGE = 0.010  # of a block's mean, full scale 1
 _SLOPES = 2.0  # how much steeper a picture is than its mean over time
 _FLUCTUATION = 3.5  # standard errors
 _CHANCE = 0.05  # by which two medians of the same variance may differ
-_QUIET = 0.75 / 255  # RMS: the last bit of eight
 _EXPECTED, _RARE = 1.5 / 255, 0.995
 
 
@@ -121,6 +120,9 @@ class Skipping:
             return frames_BTCHW
         kept, sides = self._kept[turn], frames.shape[2:]
         moved = min(moved, kept.dance) if kept else moved
+        if np.isinf(moved):  # nobody can say what of it stands still
+            self.skipped.restored += 1
+            return self._network(frames_BTCHW)
         exposure = exposures(kept.means if kept else np.median(means, axis=0), means)
         means = exposure.taken_out(means)
         spread = _fluctuation(means)
@@ -141,7 +143,7 @@ class Skipping:
         if kept is None or share == 1:
             fresh = self._network(frames_BTCHW)
         else:
-            fresh = exposure.shown(kept.picture)[None]
+            fresh = np.zeros_like(frames_BTCHW)
             for box in boxes:
                 seen = self._network(np.ascontiguousarray(frames_BTCHW[..., *box]))
                 (down, from_top), (across, from_left) = (
@@ -257,7 +259,7 @@ def dance(frames_THW: np.ndarray) -> float:
     if min(halved.shape[1:]) < 4:
         return np.inf
     variance = halved.var(0, ddof=1)
-    if np.quantile(variance, 0.999) < _QUIET**2 / 4:  # a mean of four pixels
+    if np.quantile(variance, 0.999) < LAST_BIT**2 / 4:  # a mean of four pixels
         return 0.0
     down, across = np.gradient(halved.mean(0))
     steepness = (down**2 + across**2) / 4  # of a pixel, not of two
